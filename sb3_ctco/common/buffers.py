@@ -1,0 +1,127 @@
+"""Replay buffers for options: Stable-Baselines3's, extended by the duration and the integrated reward of a decision."""
+
+from typing import Any
+
+import numpy as np
+import torch as th
+from gymnasium import spaces
+from stable_baselines3.common.buffers import DictReplayBuffer, ReplayBuffer
+from stable_baselines3.common.type_aliases import DictReplayBufferSamples, ReplayBufferSamples
+from stable_baselines3.common.vec_env import VecNormalize
+
+from sb3_ctco.options import DEFAULT_DISCOUNT_RATE, discount
+
+
+class _OptionStorage(ReplayBuffer):
+    """What the two option buffers add to their Stable-Baselines3 base."""
+
+    def __init__(
+        self,
+        buffer_size: int,
+        observation_space: spaces.Space,
+        action_space: spaces.Space,
+        device: th.device | str = "auto",
+        n_envs: int = 1,
+        optimize_memory_usage: bool = False,
+        handle_timeout_termination: bool = True,
+        discount_rate: float = DEFAULT_DISCOUNT_RATE,
+    ):
+        if optimize_memory_usage:
+            raise ValueError(
+                f"{type(self).__name__} does not support optimize_memory_usage=True: it would lose the observation "
+                "in which an option was truncated, from which its target bootstraps"
+            )
+        super().__init__(
+            buffer_size,
+            observation_space,
+            action_space,
+            device,
+            n_envs=n_envs,
+            handle_timeout_termination=handle_timeout_termination,
+        )
+        self.discount_rate = float(discount_rate)
+        self.durations = np.zeros((self.buffer_size, self.n_envs), dtype=np.float32)
+        self.integrated_rewards = np.zeros((self.buffer_size, self.n_envs), dtype=np.float32)
+
+    def add(  # type: ignore[override]
+        self,
+        obs: np.ndarray | dict[str, np.ndarray],
+        next_obs: np.ndarray | dict[str, np.ndarray],
+        action: np.ndarray,
+        reward: np.ndarray,
+        done: np.ndarray,
+        infos: list[dict[str, Any]],
+    ) -> None:
+        """Store one decision of each environment.
+
+        :param infos: each with ``info["option"]`` of :class:`~sb3_ctco.wrappers.OptionExecutionWrapper`
+        :raises ValueError: if that is missing, not finite, or was discounted at another rate; nothing is stored then
+        """
+        try:
+            options = [info["option"] for info in infos]
+        except KeyError:
+            raise ValueError(
+                f"{type(self).__name__} needs info['option']: wrap the environment with sb3_ctco.wrappers.OptionExecutionWrapper"
+            ) from None
+        durations = np.array([option["duration"] for option in options])
+        integrated_rewards = np.array([option["integrated_reward"] for option in options])
+        if not np.isfinite(integrated_rewards).all():
+            raise ValueError(f"an option's integrated reward is not finite: {integrated_rewards}")
+        discounts = np.array([option["discount"] for option in options])
+        if not np.allclose(discounts, discount(durations, self.discount_rate)):
+            raise ValueError(
+                f"the environment discounts an option of {durations} s by {discounts}, this buffer, at discount_rate="
+                f"{self.discount_rate}, by {discount(durations, self.discount_rate)}: give both the same discount_rate"
+            )
+        position = self.pos
+        super().add(obs, next_obs, action, reward, done, infos)  # type: ignore[arg-type]
+        self.durations[position] = durations
+        self.integrated_rewards[position] = integrated_rewards
+
+    def _sample_fields(self, batch_inds: np.ndarray, env: VecNormalize | None) -> dict[str, Any]:
+        # ReplayBuffer._get_samples of Stable-Baselines3 2.9 draws the environments itself, so the two further fields
+        # need it written anew; here indexing has made the copy that its to_torch would make again.
+        rows = (batch_inds, np.random.randint(0, high=self.n_envs, size=len(batch_inds)))
+        dones = self.dones[rows] * (1.0 - self.timeouts[rows])
+        return {
+            "observations": self._observations_at(self.observations, rows, env),
+            "actions": self._tensor(self.actions[rows]),
+            "next_observations": self._observations_at(self.next_observations, rows, env),
+            "dones": self._tensor(dones[:, None]),
+            "rewards": self._tensor(self.integrated_rewards[rows][:, None]),
+            "discounts": self._tensor(discount(self.durations[rows], self.discount_rate)[:, None]),
+        }
+
+    def _observations_at(self, stored: Any, rows: tuple[np.ndarray, np.ndarray], env: VecNormalize | None) -> Any:
+        if isinstance(stored, dict):
+            obs = self._normalize_obs({key: values[rows] for key, values in stored.items()}, env)
+            return {key: self._tensor(values) for key, values in obs.items()}  # type: ignore[union-attr]
+        return self._tensor(self._normalize_obs(stored[rows], env))  # type: ignore[arg-type]
+
+    def _tensor(self, array: np.ndarray) -> th.Tensor:
+        return th.as_tensor(array, device=self.device)
+
+
+class OptionReplayBuffer(_OptionStorage):
+    """Stable-Baselines3's ``ReplayBuffer`` for options.
+
+    Beside its fields it keeps ``durations`` (time that ran, s) and ``integrated_rewards`` (R), both
+    ``[buffer_size, n_envs]``. A sample has R as ``rewards`` and e^(−τ·duration) as ``discounts``, which SAC and TD3
+    use as they are: with this buffer and an environment wrapped in
+    :class:`~sb3_ctco.wrappers.OptionExecutionWrapper` they learn on the semi-Markov process.
+
+    :param discount_rate: τ, in 1/s; the wrapper's
+    :raises ValueError: if ``optimize_memory_usage`` is asked for
+    """
+
+    def _get_samples(self, batch_inds: np.ndarray, env: VecNormalize | None = None) -> ReplayBufferSamples:
+        return ReplayBufferSamples(**self._sample_fields(batch_inds, env))
+
+
+class DictOptionReplayBuffer(_OptionStorage, DictReplayBuffer):  # type: ignore[misc]
+    """Stable-Baselines3's ``DictReplayBuffer`` for options; see :class:`OptionReplayBuffer`."""
+
+    def _get_samples(  # type: ignore[override]
+        self, batch_inds: np.ndarray, env: VecNormalize | None = None
+    ) -> DictReplayBufferSamples:
+        return DictReplayBufferSamples(**self._sample_fields(batch_inds, env))

@@ -1,0 +1,304 @@
+"""The base of off-policy algorithms that decide by options: environments, replay buffer, time accounting."""
+
+import io
+import pathlib
+from typing import Any, TypeVar
+
+import gymnasium as gym
+import numpy as np
+import torch as th
+from gymnasium import spaces
+from stable_baselines3.common.base_class import maybe_make_env
+from stable_baselines3.common.buffers import ReplayBuffer
+from stable_baselines3.common.callbacks import BaseCallback, CallbackList, ConvertCallback
+from stable_baselines3.common.env_util import unwrap_wrapper
+from stable_baselines3.common.monitor import Monitor
+from stable_baselines3.common.noise import ActionNoise
+from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
+from stable_baselines3.common.policies import BasePolicy
+from stable_baselines3.common.type_aliases import (
+    GymEnv,
+    MaybeCallback,
+    RolloutReturn,
+    Schedule,
+    TrainFreq,
+    TrainFrequencyUnit,
+)
+from stable_baselines3.common.vec_env import VecEnv, unwrap_vec_normalize
+
+from sb3_ctco.common.buffers import DictOptionReplayBuffer, OptionReplayBuffer
+from sb3_ctco.common.callbacks import OptionProgressBarCallback, PrimitiveStepCallback
+from sb3_ctco.options import OptionSettings, discount_rate_from_gamma
+from sb3_ctco.wrappers import OptionExecutionWrapper, find_dt
+
+SelfOptionOffPolicyAlgorithm = TypeVar("SelfOptionOffPolicyAlgorithm", bound="OptionOffPolicyAlgorithm")
+
+
+class OptionOffPolicyAlgorithm(OffPolicyAlgorithm):
+    """Stable-Baselines3's ``OffPolicyAlgorithm`` on the semi-Markov decision process of options.
+
+    A bare environment is wrapped in :class:`~sb3_ctco.wrappers.OptionExecutionWrapper`; the settings of one that is
+    wrapped already must agree with the algorithm's. Every number of steps that a user gives or sees
+    (``total_timesteps``, ``num_timesteps``, ``learning_starts``, ``train_freq``, callbacks, logs, schedules) counts
+    primitive environment steps.
+
+    Parameters that ``OffPolicyAlgorithm`` has are documented there; these differ or are further:
+
+    :param n_rbf: number of radial basis functions an action dimension
+    :param d_max: longest duration of an option, in s
+    :param d_min: shortest duration, in s; by default one step of the environment
+    :param dt: the environment's interaction period, in s; by default found in the environment
+    :param gamma: discount factor over ``gamma_dt`` seconds, in (0, 1]
+    :param gamma_dt: in s
+    :param train_freq: collect at least this many primitive steps (in each environment) between trainings
+    :param gradient_steps: updates a training; -1 for as many as primitive steps were collected
+    :param updates_per_second: updates a second of task time, the paper's "fixed number of updates per time unit",
+        in place of ``gradient_steps``; a fraction is carried over
+    :raises ValueError: for settings out of range or contradicting each other or the environment's
+    """
+
+    def __init__(
+        self,
+        policy: str | type[BasePolicy],
+        env: GymEnv | str | None,
+        learning_rate: float | Schedule,
+        *,
+        n_rbf: int,
+        d_max: float,
+        d_min: float | None,
+        dt: float | None,
+        gamma: float,
+        gamma_dt: float,
+        updates_per_second: float | None,
+        gradient_steps: int,
+        verbose: int = 0,
+        **kwargs: Any,
+    ):
+        self.n_rbf = n_rbf
+        self.d_max = d_max
+        self.d_min = d_min
+        self.dt = dt
+        self.gamma = gamma
+        self.gamma_dt = gamma_dt
+        # An explicit dt stays the user's word on any environment; one that was found must be found again.
+        self._dt_was_given = dt is not None
+        #: τ, in 1/s
+        self.discount_rate = discount_rate_from_gamma(gamma, gamma_dt)
+        if updates_per_second is not None:
+            if gradient_steps != -1:
+                raise ValueError(
+                    f"updates_per_second={updates_per_second} and gradient_steps={gradient_steps} both say how often "
+                    "to update: pass one of them"
+                )
+            if not updates_per_second > 0:
+                raise ValueError(f"updates_per_second must be positive or None, not {updates_per_second}")
+        self.updates_per_second = updates_per_second
+        self._updates_due = 0.0
+        self._durations_since_log: list[float] = []
+
+        if env is not None:
+            env = self._as_option_env(maybe_make_env(env, verbose))
+        super().__init__(
+            policy,
+            env,  # type: ignore[arg-type]
+            learning_rate,
+            gamma=gamma,
+            gradient_steps=gradient_steps,
+            verbose=verbose,
+            sde_support=False,
+            supported_action_spaces=(spaces.Box,),
+            support_multi_env=True,
+            **kwargs,
+        )
+
+    def wrap_env(self, env: gym.Env) -> OptionExecutionWrapper:
+        """Wrap a bare environment as the algorithm wraps its own, for instance to evaluate in it.
+
+        :return: ``OptionExecutionWrapper(Monitor(env))``, a Monitor being added where there is none
+        """
+        dt = self.dt if self._dt_was_given else (find_dt(env) or self.dt)
+        if unwrap_wrapper(env, Monitor) is None:
+            env = Monitor(env)
+        return OptionExecutionWrapper(
+            env, n_rbf=self.n_rbf, d_max=self.d_max, d_min=self.d_min, dt=dt, discount_rate=self.discount_rate
+        )
+
+    def _as_option_env(self, env: GymEnv) -> GymEnv:
+        if isinstance(env, VecEnv):
+            if not all(env.env_is_wrapped(OptionExecutionWrapper)):
+                raise ValueError(
+                    f"{type(self).__name__} cannot wrap the environments of a VecEnv from outside: make it with "
+                    "make_vec_env(..., wrapper_class=OptionExecutionWrapper, wrapper_kwargs=dict(n_rbf=..., d_max=...))"
+                )
+            return env
+        wrapped = unwrap_wrapper(env, OptionExecutionWrapper)
+        if wrapped is None:
+            return self.wrap_env(env)
+        if unwrap_wrapper(env, Monitor) is None:
+            # Inside, where it counts primitive steps; Stable-Baselines3 would put it outside.
+            wrapped.env = Monitor(wrapped.env)  # type: ignore[attr-defined]
+        return env
+
+    def _check_env(self, env: VecEnv) -> OptionSettings:
+        """The options' settings of an environment, once they agree with the algorithm's."""
+        normalizer = unwrap_vec_normalize(env)
+        if normalizer is not None and normalizer.norm_reward:
+            raise ValueError(
+                "VecNormalize counts its returns per decision, whatever time a decision takes: pass norm_reward=False"
+            )
+        settings: list[OptionSettings] = env.get_attr("option_settings")
+        expected = {
+            "n_rbf": self.n_rbf,
+            "d_max": self.d_max,
+            "d_min": settings[0].d_min if self.d_min is None else self.d_min,
+            "dt": settings[0].dt if self.dt is None else self.dt,
+            "discount_rate": self.discount_rate,
+        }
+        for one in settings:
+            for name, value in expected.items():
+                if not np.isclose(getattr(one, name), value, rtol=1e-6, atol=0.0):
+                    raise ValueError(
+                        f"the environment's options have {name}={getattr(one, name)}, {type(self).__name__} has "
+                        f"{name}={value}: give both the same (discount_rate is -ln(gamma)/gamma_dt)"
+                    )
+        return settings[0]
+
+    def set_env(self, env: GymEnv, force_reset: bool = True) -> None:
+        """Stable-Baselines3's ``set_env``; a bare environment is wrapped with the algorithm's settings.
+
+        :raises ValueError: if the settings of an environment that is wrapped already differ from the algorithm's
+        """
+        env = self._wrap_env(self._as_option_env(env), self.verbose)
+        self._check_env(env)
+        super().set_env(env, force_reset)
+
+    @classmethod
+    def load(
+        cls: type[SelfOptionOffPolicyAlgorithm],
+        path: str | pathlib.Path | io.BufferedIOBase,
+        env: GymEnv | None = None,
+        device: th.device | str = "auto",
+        custom_objects: dict[str, Any] | None = None,
+        print_system_info: bool = False,
+        force_reset: bool = True,
+        **kwargs: Any,
+    ) -> SelfOptionOffPolicyAlgorithm:
+        """Stable-Baselines3's ``load``; a bare environment is wrapped with the settings in the file.
+
+        :raises ValueError: if the environment's settings differ from the file's
+        """
+        if env is not None:
+            kwargs["n_envs"] = env.num_envs if isinstance(env, VecEnv) else 1
+        model = super().load(path, None, device, custom_objects, print_system_info, force_reset, **kwargs)
+        if env is not None:
+            # Only now are the settings known that a bare environment is wrapped with.
+            model.set_env(env, force_reset)
+            if model.seed is not None:
+                model.env.seed(model.seed)  # type: ignore[union-attr]
+        return model
+
+    def _setup_model(self) -> None:
+        if self.n_steps != 1:
+            raise ValueError(f"n_steps={self.n_steps} is not supported: an option is a return over several steps already")
+        if self.optimize_memory_usage:
+            raise ValueError("optimize_memory_usage=True is not supported with options, see OptionReplayBuffer")
+        if self.replay_buffer_class is None:
+            is_dict = isinstance(self.observation_space, spaces.Dict)
+            self.replay_buffer_class = DictOptionReplayBuffer if is_dict else OptionReplayBuffer
+        elif not issubclass(self.replay_buffer_class, OptionReplayBuffer | DictOptionReplayBuffer):
+            raise ValueError(
+                f"replay_buffer_class must be OptionReplayBuffer, DictOptionReplayBuffer or a subclass, not "
+                f"{self.replay_buffer_class.__name__}, which does not keep the durations of options"
+            )
+        self.replay_buffer_kwargs = {**self.replay_buffer_kwargs, "discount_rate": self.discount_rate}
+        if self.env is not None:
+            settings = self._check_env(self.env)
+            self.dt, self.d_min = settings.dt, settings.d_min
+        super()._setup_model()
+
+    def _init_callback(self, callback: MaybeCallback, progress_bar: bool = False) -> BaseCallback:
+        if isinstance(callback, list):
+            callback = CallbackList(callback)
+        elif callback is not None and not isinstance(callback, BaseCallback):
+            callback = ConvertCallback(callback)
+        callbacks: list[BaseCallback] = [PrimitiveStepCallback(callback)]
+        if progress_bar:
+            callbacks.append(OptionProgressBarCallback())
+        return super()._init_callback(CallbackList(callbacks))
+
+    def collect_rollouts(
+        self,
+        env: VecEnv,
+        callback: BaseCallback,
+        train_freq: TrainFreq,
+        replay_buffer: ReplayBuffer,
+        action_noise: ActionNoise | None = None,
+        learning_starts: int = 0,
+        log_interval: int | None = None,
+    ) -> RolloutReturn:
+        """Collect decisions until ``train_freq`` primitive steps (or episodes) are reached.
+
+        :return: with the number of updates that are due as ``episode_timesteps``
+        """
+        start = self.num_timesteps
+        by_step = train_freq.unit == TrainFrequencyUnit.STEP
+        chunk = TrainFreq(1, TrainFrequencyUnit.STEP) if by_step else train_freq
+        while True:
+            try:
+                rollout = super().collect_rollouts(
+                    env, callback, chunk, replay_buffer, action_noise, learning_starts, log_interval
+                )
+            except BaseException:
+                # The environment may have moved on without its transition being stored: begin with a reset.
+                self._last_obs = None
+                raise
+            if not rollout.continue_training:
+                self._last_obs = None
+                break
+            if not by_step or self.num_timesteps - start >= train_freq.frequency * self.n_envs:
+                break
+        steps = self.num_timesteps - start
+        if self.updates_per_second is not None:
+            assert self.dt is not None
+            trained_steps = self.num_timesteps - max(start, learning_starts)
+            self._updates_due += max(trained_steps, 0) * self.dt * self.updates_per_second
+            steps = int(self._updates_due)
+            self._updates_due -= steps
+        return rollout._replace(episode_timesteps=steps)
+
+    def _store_transition(
+        self,
+        replay_buffer: ReplayBuffer,
+        buffer_action: np.ndarray,
+        new_obs: np.ndarray | dict[str, np.ndarray],
+        reward: np.ndarray,
+        dones: np.ndarray,
+        infos: list[dict[str, Any]],
+    ) -> None:
+        super()._store_transition(replay_buffer, buffer_action, new_obs, reward, dones, infos)
+        self._durations_since_log.extend(info["option"]["duration"] for info in infos)
+
+    def dump_logs(self) -> None:
+        """Write log data; also the mean duration and the decision rate since the last time."""
+        if self._durations_since_log:
+            duration = float(np.mean(self._durations_since_log))
+            self.logger.record("option/duration_mean", duration)
+            self.logger.record("option/decision_rate_hz", 1.0 / duration)
+            self._durations_since_log.clear()
+        super().dump_logs()
+
+    def predict(
+        self,
+        observation: np.ndarray | dict[str, np.ndarray],
+        state: tuple[np.ndarray, ...] | None = None,
+        episode_start: np.ndarray | None = None,
+        deterministic: bool = False,
+    ) -> tuple[np.ndarray, tuple[np.ndarray, ...] | None]:
+        """The policy's *option* for an observation, not an action of the bare environment.
+
+        Step the wrapped environment (``model.get_env()``, or :meth:`wrap_env` around your own) with it.
+
+        :return: the option ``[ω, d]``, shape ``[action_dim · n_rbf + 1]`` in [−1, 1] (with a leading axis for several
+            observations), and None
+        """
+        return super().predict(observation, state, episode_start, deterministic)

@@ -1,0 +1,398 @@
+"""Continuous-Time Continuous-Options (Karimi et al. 2023, https://arxiv.org/abs/2212.04407) on Stable-Baselines3."""
+
+import math
+from typing import Any, ClassVar, Literal, TypeVar
+
+import torch as th
+from stable_baselines3.common.buffers import ReplayBuffer
+from stable_baselines3.common.noise import ActionNoise
+from stable_baselines3.common.policies import BasePolicy
+from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, Schedule
+from stable_baselines3.common.utils import FloatSchedule, get_parameters_by_name, polyak_update
+
+from sb3_ctco.common.option_algorithm import OptionOffPolicyAlgorithm
+from sb3_ctco.ctco.policies import CnnPolicy, CTCOPolicy, MlpPolicy, MultiInputPolicy, OptionActor, OptionCritic
+
+SelfCTCO = TypeVar("SelfCTCO", bound="CTCO")
+
+EntropyReference = Literal["uniform", "paper"]
+
+
+def critic_target(
+    integrated_rewards: th.Tensor,
+    dones: th.Tensor,
+    discounts: th.Tensor,
+    next_q_values: th.Tensor,
+    next_entropy_costs: th.Tensor,
+    high_freq_penalty: float,
+) -> th.Tensor:
+    """R − β_h + γ(d)·(Q̂_χ'(s', ω', d') − β_E log π(ω', d'|s')), the target in the paper's L_Q (after equation (7)).
+
+    All tensors are ``[batch, 1]``.
+
+    :param integrated_rewards: R
+    :param dones: 1 where the episode terminated (not where it was truncated)
+    :param discounts: γ(d) = e^(−τ·duration)
+    :param next_q_values: smallest target Q-value of an option of the target policy
+    :param next_entropy_costs: β_E log π of that option
+    :param high_freq_penalty: β_h
+    """
+    return integrated_rewards - high_freq_penalty + (1.0 - dones) * discounts * (next_q_values - next_entropy_costs)
+
+
+def critic_loss(q_values: th.Tensor, targets: th.Tensor) -> th.Tensor:
+    """L_Q of the paper, as Stable-Baselines3's SAC scales it: half the mean square error, summed over critics.
+
+    :param q_values: ``[n_critics, batch, 1]``
+    :param targets: ``[batch, 1]``
+    """
+    return 0.5 * (q_values - targets).square().mean(dim=(1, 2)).sum()
+
+
+def actor_loss(q_values: th.Tensor, entropy_costs: th.Tensor) -> th.Tensor:
+    """L_π, equation (9) of the paper: its gradient runs through ω and d of reparameterised options.
+
+    :param q_values: ``[n_critics, batch, 1]``, of options that the policy sampled
+    :param entropy_costs: β_E log π of those options, ``[batch, 1]``
+    """
+    return (entropy_costs - q_values.amin(dim=0)).mean()
+
+
+def log_reference_density(omega_dim: int, d_min: float, d_max: float, reference: EntropyReference) -> th.Tensor:
+    """Log-density of what entropy is counted relative to, over the normalised option box.
+
+    ``"uniform"`` is the uniform distribution over all options: log π − log u is never negative on average, so
+    a decision is never paid for its entropy. ``"paper"`` is the unit density over (ω, d in s): log π as it stands.
+
+    :return: for ω and d, shape ``[2]``
+    """
+    if reference == "uniform":
+        return th.tensor([-omega_dim * math.log(2.0), -math.log(2.0)])
+    # A duration in s has (d_max − d_min)/2 of the length of the box [−1, 1].
+    return th.tensor([0.0, math.log((d_max - d_min) / 2.0) if d_max > d_min else 0.0])
+
+
+class CTCO(OptionOffPolicyAlgorithm):
+    """Continuous-Time Continuous-Options (CTCO).
+
+    The policy picks an option: the weights ω of a smooth open-loop trajectory of actions, and the time d to play it.
+    Learning is soft actor-critic on the resulting semi-Markov decision process, with a penalty per decision.
+
+    Paper: Karimi, Jin, Luo, Mahmood, Jagersand, Tosatto: "Dynamic Decision Frequency with Continuous Options",
+    IROS 2023, https://arxiv.org/abs/2212.04407
+
+    Where it differs from the paper, the paper's way is an argument away: entropy counts relative to the uniform
+    distribution (``entropy_reference="paper"``), two critics (``policy_kwargs=dict(n_critics=1)``), a temperature each
+    for ω and d, learned (pass numbers; the same one twice is the paper's β_E), ω squashed by tanh so that actions stay
+    in their bounds, and a shortest duration of one step (the paper's durations are in (0, d_max)).
+
+    Steps are primitive environment steps everywhere.
+
+    :param policy: the policy model to use (MlpPolicy, CnnPolicy, MultiInputPolicy)
+    :param env: the environment to learn from: a Gymnasium id, a bare environment, one in an
+        :class:`~sb3_ctco.wrappers.OptionExecutionWrapper`, or a VecEnv of such
+    :param learning_rate: step size of Adam for all networks and temperatures, or a function of the remaining progress
+    :param buffer_size: size of the replay buffer, in decisions
+    :param learning_starts: play random options for this many steps before learning
+    :param batch_size: decisions in a minibatch
+    :param tau: Polyak coefficient of the target networks (the paper's time constant τ follows from ``gamma``)
+    :param gamma: discount factor over ``gamma_dt`` seconds, in (0, 1]; it means the same at every ``dt``
+    :param gamma_dt: in s
+    :param train_freq: collect at least this many steps between trainings, or ``(n, "episode")``
+    :param gradient_steps: updates a training; -1 for one a step; 1 (with ``train_freq=1``) for the paper's Algorithm 1
+    :param updates_per_second: updates a second of task time, in place of ``gradient_steps``
+    :param n_rbf: number of radial basis functions an action dimension
+    :param d_max: longest duration of an option, in s
+    :param d_min: shortest duration, in s; by default one step of the environment
+    :param dt: interaction period of the environment, in s; by default found in the environment
+    :param high_freq_penalty: β_h, subtracted once a decision in the critic's target, or a function of the remaining
+        progress
+    :param ent_coef: temperature of ω: a number, ``"auto"`` to learn it, or ``"auto_0.1"`` to start at 0.1
+    :param duration_ent_coef: temperature of d, likewise
+    :param target_entropy: entropy of ω over the box [−1, 1] that a learned temperature keeps; ``"auto"`` is −dim(ω)
+    :param duration_target_entropy: likewise for d; ``"auto"`` is −1
+    :param duration_learning_rate: step size of d's head; ``learning_rate`` by default
+    :param entropy_reference: ``"uniform"`` or ``"paper"``, see :func:`log_reference_density`
+    :param action_noise: noise added to normalised options while exploring
+    :param replay_buffer_class: ``OptionReplayBuffer`` or ``DictOptionReplayBuffer``, or a subclass
+    :param replay_buffer_kwargs: keyword arguments for the replay buffer
+    :param policy_kwargs: arguments of the policy, e.g. ``dict(net_arch=dict(pi=[10, 10], qf=[64, 64]))``
+    :param stats_window_size: number of episodes that rollout statistics are averaged over
+    :param tensorboard_log: log location for TensorBoard (None for no log)
+    :param verbose: 0 for no output, 1 for info messages, 2 for debug messages
+    :param seed: seed of the pseudo-random generators
+    :param device: device to run on
+    :param _init_setup_model: whether to build the networks at the creation of the instance
+    :raises ValueError: for settings out of range, or that contradict the environment's
+    """
+
+    policy_aliases: ClassVar[dict[str, type[BasePolicy]]] = {
+        "MlpPolicy": MlpPolicy,
+        "CnnPolicy": CnnPolicy,
+        "MultiInputPolicy": MultiInputPolicy,
+    }
+    policy: CTCOPolicy
+    actor: OptionActor
+    actor_target: OptionActor
+    critic: OptionCritic
+    critic_target: OptionCritic
+
+    def __init__(
+        self,
+        policy: str | type[CTCOPolicy],
+        env: GymEnv | str | None,
+        learning_rate: float | Schedule = 3e-4,
+        buffer_size: int = 1_000_000,
+        learning_starts: int = 100,
+        batch_size: int = 256,
+        tau: float = 0.005,
+        gamma: float = 0.98,
+        gamma_dt: float = 0.05,
+        train_freq: int | tuple[int, str] = 1,
+        gradient_steps: int = -1,
+        updates_per_second: float | None = None,
+        n_rbf: int = 3,
+        d_max: float = 1.0,
+        d_min: float | None = None,
+        dt: float | None = None,
+        high_freq_penalty: float | Schedule = 0.05,
+        ent_coef: str | float = "auto",
+        duration_ent_coef: str | float = "auto",
+        target_entropy: str | float = "auto",
+        duration_target_entropy: str | float = "auto",
+        duration_learning_rate: float | Schedule | None = None,
+        entropy_reference: EntropyReference = "uniform",
+        action_noise: ActionNoise | None = None,
+        replay_buffer_class: type[ReplayBuffer] | None = None,
+        replay_buffer_kwargs: dict[str, Any] | None = None,
+        policy_kwargs: dict[str, Any] | None = None,
+        stats_window_size: int = 100,
+        tensorboard_log: str | None = None,
+        verbose: int = 0,
+        seed: int | None = None,
+        device: th.device | str = "auto",
+        _init_setup_model: bool = True,
+    ):
+        if entropy_reference not in ("uniform", "paper"):
+            raise ValueError(f"entropy_reference must be 'uniform' or 'paper', not {entropy_reference!r}")
+        super().__init__(
+            policy,
+            env,
+            learning_rate,
+            n_rbf=n_rbf,
+            d_max=d_max,
+            d_min=d_min,
+            dt=dt,
+            gamma=gamma,
+            gamma_dt=gamma_dt,
+            updates_per_second=updates_per_second,
+            buffer_size=buffer_size,
+            learning_starts=learning_starts,
+            batch_size=batch_size,
+            tau=tau,
+            train_freq=train_freq,
+            gradient_steps=gradient_steps,
+            action_noise=action_noise,
+            replay_buffer_class=replay_buffer_class,
+            replay_buffer_kwargs=replay_buffer_kwargs,
+            policy_kwargs=policy_kwargs,
+            stats_window_size=stats_window_size,
+            tensorboard_log=tensorboard_log,
+            verbose=verbose,
+            seed=seed,
+            device=device,
+        )
+        self.high_freq_penalty = high_freq_penalty
+        self.ent_coef = ent_coef
+        self.duration_ent_coef = duration_ent_coef
+        self.target_entropy = target_entropy
+        self.duration_target_entropy = duration_target_entropy
+        self.duration_learning_rate = duration_learning_rate
+        self.entropy_reference: EntropyReference = entropy_reference
+
+        if _init_setup_model:
+            self._setup_model()
+
+    def _setup_model(self) -> None:
+        super()._setup_model()
+        self._create_aliases()
+        self._high_freq_penalty_schedule = FloatSchedule(self.high_freq_penalty)
+        self._duration_lr_schedule = (
+            self.lr_schedule if self.duration_learning_rate is None else FloatSchedule(self.duration_learning_rate)
+        )
+        # Running statistics of batch normalisation are no parameters, so they are copied to the targets.
+        self._batch_norm_stats = get_parameters_by_name(self.critic, ["running_"])
+        self._batch_norm_stats += get_parameters_by_name(self.actor, ["running_"])
+        self._batch_norm_stats_target = get_parameters_by_name(self.critic_target, ["running_"])
+        self._batch_norm_stats_target += get_parameters_by_name(self.actor_target, ["running_"])
+
+        if self.target_entropy == "auto":
+            self.target_entropy = float(-self.actor.omega_dim)
+        if self.duration_target_entropy == "auto":
+            self.duration_target_entropy = -1.0
+        self._setup_temperatures()
+
+    def _setup_temperatures(self) -> None:
+        """Both temperatures and all that belongs to them as vectors ``[2]``, for ω and for d."""
+        omega_coef, omega_learned = _parse_ent_coef("ent_coef", self.ent_coef)
+        duration_coef, duration_learned = _parse_ent_coef("duration_ent_coef", self.duration_ent_coef)
+        d_min = self.d_min
+        assert d_min is not None
+        if d_min == self.d_max:
+            # A duration that is fixed has no entropy to be paid for.
+            duration_coef, duration_learned = 0.0, False
+        self._ent_coef_learned = th.tensor([omega_learned, duration_learned], device=self.device)
+        self._target_entropies = th.tensor(
+            [float(self.target_entropy), float(self.duration_target_entropy)], device=self.device
+        )
+        self._log_reference = log_reference_density(
+            self.actor.omega_dim, d_min, self.d_max, self.entropy_reference
+        ).to(self.device)
+        self.log_ent_coefs = th.tensor([omega_coef, duration_coef], device=self.device).log().requires_grad_(True)
+        self.ent_coef_optimizer: th.optim.Adam | None = None
+        if omega_learned or duration_learned:
+            self.ent_coef_optimizer = th.optim.Adam([self.log_ent_coefs], lr=self.lr_schedule(1), fused=True)
+
+    def _create_aliases(self) -> None:
+        self.actor = self.policy.actor
+        self.actor_target = self.policy.actor_target
+        self.critic = self.policy.critic
+        self.critic_target = self.policy.critic_target
+
+    def _update_learning_rate(self, optimizers: list[th.optim.Optimizer] | th.optim.Optimizer) -> None:
+        super()._update_learning_rate(optimizers)
+        self.actor.optimizer.param_groups[1]["lr"] = self._duration_lr_schedule(self._current_progress_remaining)
+
+    def entropy_costs(self, log_prob: th.Tensor) -> th.Tensor:
+        """β_E log π relative to the reference, ω's and d's with their own temperature.
+
+        :param log_prob: log π(ω|s) and log π(d|s), ``[batch, 2]``
+        :return: ``[batch, 1]``
+        """
+        return ((log_prob - self._log_reference) @ self.log_ent_coefs.detach().exp())[:, None]
+
+    def train(self, gradient_steps: int, batch_size: int = 64) -> None:
+        """Sample the replay buffer and update temperatures, critics, actor and targets.
+
+        :param gradient_steps: number of updates
+        :param batch_size: decisions in a minibatch
+        """
+        assert self.replay_buffer is not None
+        self.policy.set_training_mode(True)
+        optimizers = [self.actor.optimizer, self.critic.optimizer]
+        if self.ent_coef_optimizer is not None:
+            optimizers.append(self.ent_coef_optimizer)
+        self._update_learning_rate(optimizers)
+        high_freq_penalty = self._high_freq_penalty_schedule(self._current_progress_remaining)
+
+        actor_parameters = list(self.actor.parameters())
+        losses = []
+        for _ in range(gradient_steps):
+            data = self.replay_buffer.sample(batch_size, env=self._vec_normalize_env)
+            assert data.discounts is not None
+
+            options, log_prob = self.actor.option_log_prob(data.observations)
+            ent_coef_loss = self._update_temperatures(log_prob.detach())
+
+            with th.no_grad():
+                next_options, next_log_prob = self.actor_target.option_log_prob(data.next_observations)
+                next_q_values = self.critic_target(data.next_observations, next_options).amin(dim=0)
+                targets = critic_target(
+                    data.rewards,
+                    data.dones,
+                    data.discounts,
+                    next_q_values,
+                    self.entropy_costs(next_log_prob),
+                    high_freq_penalty,
+                )
+            q_loss = critic_loss(self.critic(data.observations, data.actions), targets)
+            self.critic.optimizer.zero_grad()
+            q_loss.backward()
+            self.critic.optimizer.step()
+
+            pi_loss = actor_loss(self.critic(data.observations, options), self.entropy_costs(log_prob))
+            self.actor.optimizer.zero_grad()
+            pi_loss.backward(inputs=actor_parameters)  # and no gradients for the critics
+            self.actor.optimizer.step()
+
+            polyak_update(self.critic.parameters(), self.critic_target.parameters(), self.tau)
+            polyak_update(self.actor.parameters(), self.actor_target.parameters(), self.tau)
+            polyak_update(self._batch_norm_stats, self._batch_norm_stats_target, 1.0)
+            losses.append(th.stack((pi_loss.detach(), q_loss.detach(), ent_coef_loss)))
+
+        self._n_updates += gradient_steps
+        # Read once, because each reading waits for the device.
+        pi_loss_mean, q_loss_mean, ent_coef_loss_mean = th.stack(losses).mean(dim=0).tolist()
+        ent_coef, duration_ent_coef = self.log_ent_coefs.detach().exp().tolist()
+        self.logger.record("train/n_updates", self._n_updates, exclude="tensorboard")
+        self.logger.record("train/ent_coef", ent_coef)
+        self.logger.record("train/duration_ent_coef", duration_ent_coef)
+        self.logger.record("train/actor_loss", pi_loss_mean)
+        self.logger.record("train/critic_loss", q_loss_mean)
+        if self.ent_coef_optimizer is not None:
+            self.logger.record("train/ent_coef_loss", ent_coef_loss_mean)
+        self.logger.record("option/high_freq_penalty", high_freq_penalty)
+
+    def _update_temperatures(self, log_prob: th.Tensor) -> th.Tensor:
+        """SAC's dual ascent on the temperatures of ω and d; those that are fixed get no gradient.
+
+        :param log_prob: ``[batch, 2]``, over the normalised box
+        :return: the loss
+        """
+        if self.ent_coef_optimizer is None:
+            return th.zeros((), device=self.device)
+        excess = th.where(self._ent_coef_learned, log_prob.mean(dim=0) + self._target_entropies, 0.0)
+        # A temperature of zero is fixed and has no finite logarithm.
+        loss = -(th.where(self._ent_coef_learned, self.log_ent_coefs, 0.0) * excess).sum()
+        self.ent_coef_optimizer.zero_grad()
+        loss.backward()
+        self.ent_coef_optimizer.step()
+        return loss.detach()
+
+    def learn(
+        self: SelfCTCO,
+        total_timesteps: int,
+        callback: MaybeCallback = None,
+        log_interval: int = 4,
+        tb_log_name: str = "CTCO",
+        reset_num_timesteps: bool = True,
+        progress_bar: bool = False,
+    ) -> SelfCTCO:
+        """Learn for ``total_timesteps`` primitive steps, up to the end of the option that reaches them.
+
+        Parameters are those of Stable-Baselines3's ``learn``.
+        """
+        return super().learn(
+            total_timesteps=total_timesteps,
+            callback=callback,
+            log_interval=log_interval,
+            tb_log_name=tb_log_name,
+            reset_num_timesteps=reset_num_timesteps,
+            progress_bar=progress_bar,
+        )
+
+    def _excluded_save_params(self) -> list[str]:
+        aliases = ["actor", "actor_target", "critic", "critic_target"]
+        derived = ["_batch_norm_stats", "_batch_norm_stats_target", "_ent_coef_learned", "_target_entropies", "_log_reference"]
+        return super()._excluded_save_params() + aliases + derived
+
+    def _get_torch_save_params(self) -> tuple[list[str], list[str]]:
+        state_dicts = ["policy", "actor.optimizer", "critic.optimizer"]
+        if self.ent_coef_optimizer is not None:
+            state_dicts.append("ent_coef_optimizer")
+        return state_dicts, ["log_ent_coefs"]
+
+
+def _parse_ent_coef(name: str, value: str | float) -> tuple[float, bool]:
+    """A temperature's initial value, and whether it is learned.
+
+    :raises ValueError: if ``value`` is neither a number that is at least 0, nor "auto", nor "auto_<positive number>"
+    """
+    learned = isinstance(value, str) and (value == "auto" or value.startswith("auto_"))
+    try:
+        initial = float(value.removeprefix("auto").removeprefix("_") or 1.0) if learned else float(value)  # type: ignore
+    except ValueError:
+        initial = -1.0
+    if initial < 0 or (learned and initial == 0) or not math.isfinite(initial):
+        raise ValueError(f"{name} must be a number of at least 0, 'auto', or 'auto_<positive number>', not {value!r}")
+    return initial, learned

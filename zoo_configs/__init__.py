@@ -1,0 +1,1 @@
+"""RL Baselines3 Zoo hyperparameter files of sb3-ctco."""
