@@ -220,6 +220,8 @@ class CTCO(OptionOffPolicyAlgorithm):
         self._duration_lr_schedule = (
             self.lr_schedule if self.duration_learning_rate is None else FloatSchedule(self.duration_learning_rate)
         )
+        self._source_parameters = [*self.critic.parameters(), *self.actor.parameters()]
+        self._target_parameters = [*self.critic_target.parameters(), *self.actor_target.parameters()]
         # Running statistics of batch normalisation are no parameters, so they are copied to the targets.
         self._batch_norm_stats = get_parameters_by_name(self.critic, ["running_"])
         self._batch_norm_stats += get_parameters_by_name(self.actor, ["running_"])
@@ -315,8 +317,9 @@ class CTCO(OptionOffPolicyAlgorithm):
             pi_loss.backward(inputs=actor_parameters)  # and no gradients for the critics
             self.actor.optimizer.step()
 
-            polyak_update(self.critic.parameters(), self.critic_target.parameters(), self.tau)
-            polyak_update(self.actor.parameters(), self.actor_target.parameters(), self.tau)
+            with th.no_grad():
+                # Stable-Baselines3's polyak_update of all parameters in one call
+                th._foreach_lerp_(self._target_parameters, self._source_parameters, self.tau)
             polyak_update(self._batch_norm_stats, self._batch_norm_stats_target, 1.0)
             losses.append(th.stack((pi_loss.detach(), q_loss.detach(), ent_coef_loss)))
 
@@ -343,11 +346,11 @@ class CTCO(OptionOffPolicyAlgorithm):
             return th.zeros((), device=self.device)
         excess = th.where(self._ent_coef_learned, log_prob.mean(dim=0) + self._target_entropies, 0.0)
         # A temperature of zero is fixed and has no finite logarithm.
-        loss = -(th.where(self._ent_coef_learned, self.log_ent_coefs, 0.0) * excess).sum()
-        self.ent_coef_optimizer.zero_grad()
-        loss.backward()
+        loss = -(th.where(self._ent_coef_learned, self.log_ent_coefs.detach(), 0.0) * excess).sum()
+        # The loss is linear in the logarithms, so its gradient needs no backward pass.
+        self.log_ent_coefs.grad = -excess
         self.ent_coef_optimizer.step()
-        return loss.detach()
+        return loss
 
     def learn(
         self: SelfCTCO,
@@ -373,7 +376,15 @@ class CTCO(OptionOffPolicyAlgorithm):
 
     def _excluded_save_params(self) -> list[str]:
         aliases = ["actor", "actor_target", "critic", "critic_target"]
-        derived = ["_batch_norm_stats", "_batch_norm_stats_target", "_ent_coef_learned", "_target_entropies", "_log_reference"]
+        derived = [
+            "_source_parameters",
+            "_target_parameters",
+            "_batch_norm_stats",
+            "_batch_norm_stats_target",
+            "_ent_coef_learned",
+            "_target_entropies",
+            "_log_reference",
+        ]
         return super()._excluded_save_params() + aliases + derived
 
     def _get_torch_save_params(self) -> tuple[list[str], list[str]]:
