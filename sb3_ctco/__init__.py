@@ -6,7 +6,6 @@ from sb3_ctco.ctco import CTCO
 from sb3_ctco.envs import register_envs
 from sb3_ctco.wrappers import OptionExecutionWrapper
 
-
 __all__ = ["CTCO", "DictOptionReplayBuffer", "OptionExecutionWrapper", "OptionReplayBuffer", "__version__"]
 
 register_envs()

@@ -1,6 +1,7 @@
 """Every task of dm_control's suite at any control period, as a Gymnasium environment that can play whole options."""
 
 import math
+import warnings
 from collections.abc import Callable, Iterator, Mapping
 from typing import Any
 
@@ -10,8 +11,12 @@ from gymnasium import spaces
 
 try:
     import mujoco
-    from dm_control import suite
-    from dm_control.rl.control import PhysicsError
+
+    with warnings.catch_warnings():
+        # Without a display glfw warns, though nothing here needs a window.
+        warnings.filterwarnings("ignore", message=".*GLFWError.*|.*DISPLAY.*")
+        from dm_control import suite
+        from dm_control.rl.control import PhysicsError
 except ImportError as error:  # pragma: no cover
     raise ImportError("this environment needs dm_control: pip install 'sb3-ctco[dm-control]'") from error
 
