@@ -216,7 +216,6 @@ class CTCO(OptionOffPolicyAlgorithm):
     def _setup_model(self) -> None:
         super()._setup_model()
         self._create_aliases()
-        self._high_freq_penalty_schedule = FloatSchedule(self.high_freq_penalty)
         self._duration_lr_schedule = (
             self.lr_schedule if self.duration_learning_rate is None else FloatSchedule(self.duration_learning_rate)
         )
@@ -285,7 +284,8 @@ class CTCO(OptionOffPolicyAlgorithm):
         if self.ent_coef_optimizer is not None:
             optimizers.append(self.ent_coef_optimizer)
         self._update_learning_rate(optimizers)
-        high_freq_penalty = self._high_freq_penalty_schedule(self._current_progress_remaining)
+        # Read anew, so that it can be changed between trainings.
+        high_freq_penalty = FloatSchedule(self.high_freq_penalty)(self._current_progress_remaining)
 
         actor_parameters = list(self.actor.parameters())
         losses = []
