@@ -95,9 +95,7 @@ def test_densities_against_a_change_of_variables():
 
 def test_entropy_references():
     # Uniform over [−1, 1]^6 and over [−1, 1]
-    th.testing.assert_close(
-        log_reference_density(6, 0.1, 1.0, "uniform"), th.tensor([-6 * math.log(2.0), -math.log(2.0)])
-    )
+    th.testing.assert_close(log_reference_density(6, 0.1, 1.0, "uniform"), th.tensor([-6 * math.log(2.0), -math.log(2.0)]))
     # The unit density over ω and over d in s: [0.1, 2.1] s is as long as [−1, 1].
     th.testing.assert_close(log_reference_density(6, 0.1, 2.1, "paper"), th.zeros(2))
     th.testing.assert_close(log_reference_density(6, 0.1, 0.6, "paper"), th.tensor([0.0, math.log(0.25)]))

@@ -74,10 +74,8 @@ def test_each_entry_builds_and_takes_200_steps(tmp_path, models, algo, name):
 
 
 def test_the_wrapper_has_the_settings_of_the_entry_and_the_command_line(tmp_path, models):
-    main(
-        ["train", "--env", "Pendulum-v1", "-f", str(tmp_path), *FEW_STEPS]
-        + [*FEW_STEPS_PARAMS, "n_rbf:4", "gamma:0.9", "gamma_dt:0.1"]
-    )
+    params = [*FEW_STEPS_PARAMS, "n_rbf:4", "gamma:0.9", "gamma_dt:0.1"]
+    main(["train", "--env", "Pendulum-v1", "-f", str(tmp_path), *FEW_STEPS, *params])
     (model,) = models
     assert model.n_rbf == 4
     assert model.d_max == entries("ctco")["Pendulum-v1"]["d_max"]
@@ -138,19 +136,16 @@ def test_training_goes_on_from_a_saved_agent(tmp_path, models):
 
 @pytest.mark.slow
 def test_environments_in_processes_of_their_own(tmp_path, models):
-    main(
-        ["train", "--env", "sb3_ctco/point_mass-sparse-50hz-v0", "-f", str(tmp_path), "--vec-env", "subproc"]
-        + [*FEW_STEPS, *FEW_STEPS_PARAMS, "n_envs:2"]
-    )
+    flags = ["--env", "sb3_ctco/point_mass-sparse-50hz-v0", "--vec-env", "subproc", "-f", str(tmp_path)]
+    main(["train", *flags, *FEW_STEPS, *FEW_STEPS_PARAMS, "n_envs:2"])
     assert models[0].n_envs == 2
     assert models[0].num_timesteps >= 200
 
 
 def test_two_trials_of_tuning(tmp_path):
-    main(
-        ["tune", "--env", "Pendulum-v1", "-f", str(tmp_path), "-n", "400", "--seed", "0", "--n-trials", "2"]
-        + ["--n-evaluations", "2", "--eval-episodes", "1", "--pruner", "none", "--no-optim-plots", *FEW_STEPS_PARAMS]
-    )
+    flags = ["--env", "Pendulum-v1", "-f", str(tmp_path), "-n", "400", "--seed", "0", "--n-trials", "2"]
+    flags += ["--n-evaluations", "2", "--eval-episodes", "1", "--pruner", "none", "--no-optim-plots"]
+    main(["tune", *flags, *FEW_STEPS_PARAMS])
     (report,) = (tmp_path / "ctco").glob("report_*.csv")
     trials = list(csv.DictReader(report.open()))
     assert len(trials) == 2

@@ -304,11 +304,14 @@ class OptionOffPolicyAlgorithm(OffPolicyAlgorithm):
         self._durations_since_log.extend(info["option"]["duration"] for info in infos)
 
     def dump_logs(self) -> None:
-        """Write log data; also the mean duration and the decision rate since the last time."""
+        """Write log data; also the durations of options, their mean and the decision rate since the last time."""
         if self._durations_since_log:
             duration = float(np.mean(self._durations_since_log))
             self.logger.record("option/duration_mean", duration)
             self.logger.record("option/decision_rate_hz", 1.0 / duration)
+            # TensorBoard shows a tensor as a histogram; other formats cannot.
+            durations = th.tensor(self._durations_since_log)
+            self.logger.record("option/duration", durations, exclude=("stdout", "log", "json", "csv"))
             self._durations_since_log.clear()
         super().dump_logs()
 
