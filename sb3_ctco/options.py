@@ -67,7 +67,7 @@ def steps_in(duration: float, dt: float) -> int:
 
 
 def basis(phase: FloatArray, n_rbf: int) -> FloatArray:
-    """Normalised radial basis functions φ(t/d), equation (5) of the paper.
+    """Normalised radial basis functions φ(t/d), equation (4) of the paper.
 
     Centres stand at ``linspace(−0.5/n, 1 + 0.5/n, n)`` (0.5 for n = 1) with the variance ½((1 + 1/n)/n)². Each row
     sums to one, so φᵀω stays inside any box that ω is in, and ``n_rbf=1`` repeats one action.
@@ -99,7 +99,7 @@ def basis_of_steps(n_steps: int, n_rbf: int) -> FloatArray:
 
 
 def action_plan(omega: FloatArray, n_steps: int) -> FloatArray:
-    """The whole open-loop action trajectory a_t = φ(t/d)ᵀω of an option, equation (5) of the paper.
+    """The whole open-loop action trajectory a_t = φ(t/d)ᵀω of an option, equation (4) of the paper.
 
     :param omega: weights, shape ``[action_dim, n_rbf]``
     :param n_steps: number of primitive steps of the option
@@ -132,7 +132,7 @@ def step_weight(dt: float, discount_rate: float) -> float:
 
 
 def integrated_reward(rewards: FloatArray, dt: float, discount_rate: float, unit: RewardUnit = "rate") -> float:
-    """R(s, ω, d) = ∫₀ᵈ e^(−τκ) r dκ, equation (6) of the paper, for rewards sampled once a step.
+    """R(s, ω, d) = ∫₀ᵈ e^(−τκ) r dκ, equation (5) of the paper, for rewards sampled once a step.
 
     A reward ``"rate"`` is held over its step, which makes the sum the exact integral of a piecewise constant rate.
     An ``"impulse"`` is paid at once, at the start of its step: Σ e^(−τk·dt)·r_k.

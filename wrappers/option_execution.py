@@ -66,7 +66,7 @@ class OptionExecutionWrapper(gym.Wrapper, RecordConstructorArgs):
     whole number of primitive steps (half up, at least one), computes all actions in one go, plays them, stops early
     at the end of the episode, and returns the last observation and info. Entries outside [−1, 1] are clipped.
 
-    ``info["option"]`` tells what ran: ``duration`` (s), ``n_steps``, ``integrated_reward`` (R, equation (6) of
+    ``info["option"]`` tells what ran: ``duration`` (s), ``n_steps``, ``integrated_reward`` (R, equation (5) of
     Karimi et al. 2023) and ``discount`` (e^(−τ·duration)).
 
     The order of wrappers is ``OptionExecutionWrapper(Monitor(TimeLimit(env)))``: what is inside sees primitive steps.

@@ -16,7 +16,7 @@ from sb3_ctco.options import DEFAULT_DISCOUNT_RATE, discount, step_weight
 
 
 def mean_absolute_jerk(actions: npt.ArrayLike, dt: float) -> float:
-    """Mean absolute third derivative of an action signal, by finite differences: mean |Δ³a|/dt³.
+    """Mean absolute third derivative of an action signal, by finite differences: the mean size of Δ³a/dt³.
 
     The measure of Hogan and Sternad 2009, "Sensitivity of Smoothness Measures to Movement Duration, Amplitude, and
     Arrests", https://doi.org/10.3200/35-09-004-RC, of the action in place of a position. A signal with jumps has a jerk
@@ -57,7 +57,7 @@ def spectral_smoothness(actions: npt.ArrayLike) -> float:
 class EpisodeStatistics:
     """What an episode was worth, and how it was played.
 
-    :param discounted_return: ∫ e^(−τt) r dt, equation (3) of Karimi et al. 2023, in reward rate × s
+    :param discounted_return: ∫ e^(−τt) r dt, equation (2) of Karimi et al. 2023, in reward rate × s
     :param seconds: task time of the episode, in s
     :param decisions: how often the policy was asked
     :param episode_return: sum of the rewards that ``step`` returned
