@@ -88,10 +88,7 @@ def plot(runs: dict[str, list[Run]], args: argparse.Namespace, path: Path) -> No
     figure, axis = plt.subplots(figsize=(6.5, 4), layout="constrained")
     for name, of_name in runs.items():
         curves = np.array([curve(run, grid, args.window) for run in of_name])
-        (line,) = axis.plot(grid, curves.mean(axis=0), linewidth=1.8)
-        axis.annotate(
-            name, (grid[-1], curves[:, -1].mean()), (4, 0), textcoords="offset points", va="center", color=line.get_color()
-        )
+        (line,) = axis.plot(grid, curves.mean(axis=0), linewidth=1.8, label=name)
         if len(of_name) > 1:
             axis.fill_between(grid, curves.min(axis=0), curves.max(axis=0), alpha=0.2, color=line.get_color(), linewidth=0)
     n_seeds = len(next(iter(runs.values())))
@@ -100,7 +97,8 @@ def plot(runs: dict[str, list[Run]], args: argparse.Namespace, path: Path) -> No
     axis.set_ylabel(f"training return, mean of {args.window} episodes")
     axis.set_title(f"{args.env}{band}", fontsize=10, loc="left", pad=34)
     axis.set_xlim(0, args.steps)
-    axis.spines[["right"]].set_visible(False)
+    axis.legend(frameon=False, loc="lower right")
+    axis.spines["right"].set_visible(False)
     task_time = axis.secondary_xaxis("top", functions=(lambda n: n * seconds_per_step, lambda s: s / seconds_per_step))
     task_time.set_xlabel("task time, s")
     figure.savefig(path, dpi=150, bbox_inches="tight")

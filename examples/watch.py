@@ -66,7 +66,9 @@ def plot(trace: Trace, title: str, path: Path) -> None:
         axis.plot(time, actions[:, i], color=BLUE, linewidth=1.2)
         axis.plot(time[decided], actions[decided, i], "o", color=BLUE, markersize=3.5)
         axis.set_ylabel("action" if n_actions == 1 else f"action {i + 1}")
-    rows[-2].hlines(np.array(trace.durations)[decided], time[decided], np.append(time[decided[1:]], len(actions) * trace.dt), color=BLUE)
+    rows[-2].hlines(
+        np.array(trace.durations)[decided], time[decided], np.append(time[decided[1:]], len(actions) * trace.dt), color=BLUE
+    )
     rows[-2].set_ylabel("duration, s")
     rows[-2].set_ylim(bottom=0)
     rows[-1].plot(time, trace.rewards, color=BLUE, linewidth=1.2)

@@ -425,7 +425,7 @@ def test_a_bad_environment_leaves_no_trace_in_the_buffer(scripted_env, bad):
 
     env = Env(truncate_at=20)
     model = make(env, d_max=0.5, learning_starts=1000)
-    with pytest.raises((RuntimeError, ValueError), match="the motor is hot|not finite"):
+    with pytest.raises((RuntimeError, ValueError), match=r"the motor is hot|not finite"):
         model.learn(100)
     buffer = model.replay_buffer
     stored = buffer.pos
@@ -475,7 +475,7 @@ def test_save_and_load(tmp_path, random_walk_env):
             alone.set_env(OptionExecutionWrapper(random_walk_env(), **other))
     faster = random_walk_env()
     faster.dt = 0.05
-    with pytest.raises(ValueError, match="options have dt=0.05"):
+    with pytest.raises(ValueError, match=r"options have dt=0\.05"):
         CTCO.load(tmp_path / "model", env=faster)
     # On purpose, the same policy runs at another rate.
     assert CTCO.load(tmp_path / "model", env=faster, dt=0.05).learn(30).num_timesteps >= 30

@@ -37,7 +37,9 @@ class SupportsStepSequence(Protocol):
     last step terminated or truncated the episode, and the last step's info.
     """
 
-    def step_sequence(self, actions: np.ndarray) -> SequenceResult: ...
+    def step_sequence(self, actions: np.ndarray) -> SequenceResult:
+        """Play actions ``[n_steps, *action_shape]``."""
+        ...
 
 
 def find_dt(env: gym.Env) -> float | None:
@@ -97,7 +99,7 @@ class OptionExecutionWrapper(gym.Wrapper, RecordConstructorArgs):
     :raises ValueError: if its bounds are not finite, a setting is out of range, or dt is not given and not found
     """
 
-    action_space: spaces.Box  # type: ignore[assignment]
+    action_space: spaces.Box  # type: ignore[assignment, override]
 
     def __init__(
         self,
@@ -125,7 +127,7 @@ class OptionExecutionWrapper(gym.Wrapper, RecordConstructorArgs):
         space = env.action_space
         if not isinstance(space, spaces.Box):
             raise TypeError(
-                f"OptionExecutionWrapper needs a Box action space, not {space}: an option is a trajectory of continuous actions"
+                f"OptionExecutionWrapper needs a Box action space, not {space}: options are trajectories of continuous actions"
             )
         if not (np.isfinite(space.low).all() and np.isfinite(space.high).all()):
             raise ValueError(
@@ -180,9 +182,7 @@ class OptionExecutionWrapper(gym.Wrapper, RecordConstructorArgs):
         if not np.isfinite(option).all():
             raise ValueError(f"an option must be finite, not {option}")
         if self._play is None:
-            raise ResetNeeded(
-                "call reset() first: the environment was not reset, its episode has ended, or it raised an error"
-            )
+            raise ResetNeeded("call reset() first: the environment was not reset, its episode ended, or it raised an error")
         play, self._play = self._play, None
 
         obs, rewards, terminated, truncated, info = play(self.plan(option))
@@ -218,11 +218,11 @@ class OptionExecutionWrapper(gym.Wrapper, RecordConstructorArgs):
         )
 
     def _step_in_a_loop(self, actions: np.ndarray) -> SequenceResult:
-        rewards = []
+        rewards: list[float] = []
         step = self.env.step
         for action in actions:
             obs, reward, terminated, truncated, info = step(action)
-            rewards.append(reward)
+            rewards.append(reward)  # type: ignore[arg-type]
             if terminated or truncated:
                 break
         return obs, rewards, terminated, truncated, info

@@ -219,8 +219,8 @@ class CTCO(OptionOffPolicyAlgorithm):
         self._duration_lr_schedule = (
             self.lr_schedule if self.duration_learning_rate is None else FloatSchedule(self.duration_learning_rate)
         )
-        self._source_parameters = [*self.critic.parameters(), *self.actor.parameters()]
-        self._target_parameters = [*self.critic_target.parameters(), *self.actor_target.parameters()]
+        self._source_parameters: list[th.Tensor] = [*self.critic.parameters(), *self.actor.parameters()]
+        self._target_parameters: list[th.Tensor] = [*self.critic_target.parameters(), *self.actor_target.parameters()]
         # Running statistics of batch normalisation are no parameters, so they are copied to the targets.
         self._batch_norm_stats = get_parameters_by_name(self.critic, ["running_"])
         self._batch_norm_stats += get_parameters_by_name(self.actor, ["running_"])
@@ -246,9 +246,9 @@ class CTCO(OptionOffPolicyAlgorithm):
         self._target_entropies = th.tensor(
             [float(self.target_entropy), float(self.duration_target_entropy)], device=self.device
         )
-        self._log_reference = log_reference_density(
-            self.actor.omega_dim, d_min, self.d_max, self.entropy_reference
-        ).to(self.device)
+        self._log_reference = log_reference_density(self.actor.omega_dim, d_min, self.d_max, self.entropy_reference).to(
+            self.device
+        )
         self.log_ent_coefs = th.tensor([omega_coef, duration_coef], device=self.device).log().requires_grad_(True)
         self.ent_coef_optimizer: th.optim.Adam | None = None
         if omega_learned or duration_learned:

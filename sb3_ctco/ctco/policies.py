@@ -34,6 +34,7 @@ class OptionActor(BasePolicy):
     """
 
     action_space: spaces.Box
+    squash_scale: th.Tensor
 
     def __init__(
         self,
@@ -100,6 +101,7 @@ class OptionActor(BasePolicy):
         return y.tanh(), th.stack((omega_log_prob, log_prob[:, -1]), dim=1)
 
     def forward(self, obs: PyTorchObs, deterministic: bool = False) -> th.Tensor:
+        """Options ``[batch, omega_dim + 1]`` in [−1, 1]: sampled, or those of the means."""
         mean, log_std = self.distribution_parameters(obs)
         x = mean if deterministic else mean + th.randn_like(mean) * log_std.exp()
         return th.tanh(x * self.squash_scale)
@@ -216,7 +218,7 @@ class CTCOPolicy(sac_policies.SACPolicy):
                 {"params": [p for p in self.actor.parameters() if p not in head]},
                 {"params": list(self.actor.duration_head.parameters())},
             ],
-            lr=lr_schedule(1),
+            lr=lr_schedule(1),  # type: ignore[call-arg]
             **self.optimizer_kwargs,
         )
         self.actor_target = self.make_actor()
@@ -226,10 +228,12 @@ class CTCOPolicy(sac_policies.SACPolicy):
             target.set_training_mode(False)
 
     def make_actor(self, features_extractor: BaseFeaturesExtractor | None = None) -> OptionActor:  # type: ignore[override]
+        """An actor; with a features extractor of its own unless one is given."""
         kwargs = self._update_features_extractor(self.net_args, features_extractor)
         return OptionActor(**kwargs).to(self.device)
 
     def make_critic(self, features_extractor: BaseFeaturesExtractor | None = None) -> OptionCritic:  # type: ignore[override]
+        """An ensemble of critics; with a features extractor of its own unless one is given."""
         kwargs = self._update_features_extractor(self.critic_kwargs, features_extractor)
         return OptionCritic(**kwargs).to(self.device)
 
