@@ -1,11 +1,44 @@
 """Continuous-Time Continuous-Options for Stable-Baselines3: reinforcement learning that decides when to decide."""
 
-from sb3_ctco._version import __version__
-from sb3_ctco.common.buffers import DictOptionReplayBuffer, OptionReplayBuffer
-from sb3_ctco.ctco import CTCO
-from sb3_ctco.envs import register_envs
-from sb3_ctco.wrappers import OptionExecutionWrapper
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
 
-__all__ = ["CTCO", "DictOptionReplayBuffer", "OptionExecutionWrapper", "OptionReplayBuffer", "__version__"]
+from sb3_ctco._version import __version__
+from sb3_ctco.envs import register_envs
+
+if TYPE_CHECKING:
+    from sb3_ctco.common.buffers import DictOptionReplayBuffer, OptionReplayBuffer
+    from sb3_ctco.controller import OptionController
+    from sb3_ctco.ctco import CTCO
+    from sb3_ctco.wrappers import OptionExecutionWrapper
+
+__all__ = [
+    "CTCO",
+    "DictOptionReplayBuffer",
+    "OptionController",
+    "OptionExecutionWrapper",
+    "OptionReplayBuffer",
+    "__version__",
+]
+
+# Imported when first used, so that a control loop that runs an exported policy does not load PyTorch.
+_HOMES = {
+    "CTCO": "sb3_ctco.ctco",
+    "DictOptionReplayBuffer": "sb3_ctco.common.buffers",
+    "OptionController": "sb3_ctco.controller",
+    "OptionExecutionWrapper": "sb3_ctco.wrappers",
+    "OptionReplayBuffer": "sb3_ctco.common.buffers",
+}
+
+
+def __getattr__(name: str) -> Any:
+    if name not in _HOMES:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    return getattr(import_module(_HOMES[name]), name)
+
+
+def __dir__() -> list[str]:
+    return sorted({*globals(), *__all__})
+
 
 register_envs()

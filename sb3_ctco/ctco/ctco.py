@@ -26,7 +26,7 @@ def critic_target(
     next_entropy_costs: th.Tensor,
     high_freq_penalty: float,
 ) -> th.Tensor:
-    """R − β_h + γ(d)·(Q̂_χ'(s', ω', d') − β_E log π(ω', d'|s')), the target in the paper's L_Q (after equation (7)).
+    """``R − β_h + γ(d)·(Q̂_χ'(s', ω', d') − β_E log π(ω', d'|s'))``, the target in the paper's L_Q (after equation (6)).
 
     All tensors are ``[batch, 1]``.
 
@@ -50,7 +50,7 @@ def critic_loss(q_values: th.Tensor, targets: th.Tensor) -> th.Tensor:
 
 
 def actor_loss(q_values: th.Tensor, entropy_costs: th.Tensor) -> th.Tensor:
-    """L_π, equation (9) of the paper: its gradient runs through ω and d of reparameterised options.
+    """L_π, equation (8) of the paper: its gradient runs through ω and d of reparameterised options.
 
     :param q_values: ``[n_critics, batch, 1]``, of options that the policy sampled
     :param entropy_costs: β_E log π of those options, ``[batch, 1]``
