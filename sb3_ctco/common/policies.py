@@ -50,6 +50,12 @@ class EnsembleLinear(nn.Module):
         """
         return th.baddbmm(self.bias, x, self.weight)
 
+    def orthogonal_(self, gain: float) -> None:
+        """Initialise each member orthogonally, with zero bias, as Stable-Baselines3's on-policy algorithms do."""
+        for weight in self.weight.data:
+            nn.init.orthogonal_(weight, gain=gain)
+        nn.init.zeros_(self.bias)
+
 
 class SquashedActor(BasePolicy):
     """The body of an actor whose output is in [−1, 1]; subclasses add heads.
