@@ -187,7 +187,6 @@ class CTCO(SoftOptionActorCritic):
 
     def _setup_model(self) -> None:
         super()._setup_model()
-        self._high_freq_penalty_schedule = FloatSchedule(self.high_freq_penalty)
         self._duration_lr_schedule = (
             self.lr_schedule if self.duration_learning_rate is None else FloatSchedule(self.duration_learning_rate)
         )
@@ -231,7 +230,7 @@ class CTCO(SoftOptionActorCritic):
             data.discounts,
             next_q_values,
             self.entropy_costs(next_log_prob),
-            self._high_freq_penalty_schedule(self._current_progress_remaining),
+            self._current_high_freq_penalty(),
         )
 
     def _actor_loss(self, obs: PyTorchObs, sample: tuple[th.Tensor, ...]) -> th.Tensor:
@@ -245,7 +244,11 @@ class CTCO(SoftOptionActorCritic):
         :param batch_size: decisions in a minibatch
         """
         super().train(gradient_steps, batch_size)
-        self.logger.record("option/high_freq_penalty", self._high_freq_penalty_schedule(self._current_progress_remaining))
+        self.logger.record("option/high_freq_penalty", self._current_high_freq_penalty())
+
+    def _current_high_freq_penalty(self) -> float:
+        # Read anew, so that it can be changed between trainings.
+        return FloatSchedule(self.high_freq_penalty)(self._current_progress_remaining)
 
     def learn(
         self: SelfCTCO,

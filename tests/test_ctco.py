@@ -1,0 +1,574 @@
+import math
+
+import gymnasium as gym
+import numpy as np
+import pytest
+import torch as th
+from gymnasium import spaces
+from stable_baselines3.common.buffers import ReplayBuffer
+from stable_baselines3.common.env_util import make_vec_env
+from stable_baselines3.common.noise import NormalActionNoise
+from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecNormalize
+from torch.distributions import Normal
+
+from sb3_ctco import CTCO, DictOptionReplayBuffer, OptionExecutionWrapper, OptionReplayBuffer
+from sb3_ctco.ctco.ctco import actor_loss, critic_loss, critic_target, log_reference_density
+from sb3_ctco.ctco.policies import CTCOPolicy, EnsembleLinear, squashed_log_prob
+from sb3_ctco.options import DEFAULT_DISCOUNT_RATE, step_weight
+
+SMALL = {"policy_kwargs": {"net_arch": [8]}, "batch_size": 8, "device": "cpu", "seed": 0, "learning_starts": 20}
+
+
+def make(env, **kwargs):
+    return CTCO("MlpPolicy", env, **{**SMALL, **kwargs})
+
+
+# --- losses, from numbers worked by hand
+
+
+def test_critic_target_by_hand():
+    column = lambda *values: th.tensor(values)[:, None]  # noqa: E731
+    # R − β_h + γ(d)·(Q' − cost); the second row terminated: 1 − 0.1 + 0.5·(4 − 2) and 3 − 0.1
+    target = critic_target(
+        column(1.0, 3.0), column(0.0, 1.0), column(0.5, 0.9), column(4.0, 7.0), column(2.0, 5.0), high_freq_penalty=0.1
+    )
+    th.testing.assert_close(target, column(1.9, 2.9))
+
+
+def test_losses_by_hand():
+    q_values = th.tensor([[[1.0], [2.0]], [[3.0], [0.0]]])  # [2 critics, batch of 2, 1]
+    # ½·mean(0², 1²) + ½·mean(2², 1²)
+    assert critic_loss(q_values, th.tensor([[1.0], [1.0]])).item() == pytest.approx(0.25 + 1.25)
+    # mean(0.5 − min(1, 3), 0.25 − min(2, 0))
+    assert actor_loss(q_values, th.tensor([[0.5], [0.25]])).item() == pytest.approx((-0.5 + 0.25) / 2)
+
+
+def test_the_policy_gradient_runs_through_omega_and_d():
+    """Equation (8): the gradient of L_π against finite differences of Q on a quadratic critic."""
+    th.manual_seed(0)
+    matrix = th.randn(4, 4, dtype=th.float64)
+    noise = th.randn(16, 3, dtype=th.float64)
+    parameters = th.randn(6, dtype=th.float64).requires_grad_(True)
+    reference = log_reference_density(2, 0.1, 1.0, "uniform").double()
+    coefficients = th.tensor([0.3, 0.7], dtype=th.float64)
+    scale = th.tensor([1.0, 1.0, 0.5], dtype=th.float64)
+
+    def loss(values):
+        mean, log_std = values[:3], values[3:]
+        y = (mean + noise * log_std.exp()) * scale
+        log_prob = squashed_log_prob(noise, log_std.expand_as(noise), y) - scale.log()
+        parts = th.stack((log_prob[:, :2].sum(dim=1), log_prob[:, 2]), dim=1)
+        costs = ((parts - reference) @ coefficients)[:, None]
+        x = th.cat((y.tanh(), th.ones(16, 1, dtype=th.float64)), dim=1)
+        q_value = -((x @ matrix) * x).sum(dim=1, keepdim=True)
+        return actor_loss(q_value[None], costs)
+
+    loss(parameters).backward()
+    for i in range(6):
+        step = th.zeros(6, dtype=th.float64)
+        step[i] = 1e-6
+        with th.no_grad():
+            difference = (loss(parameters + step) - loss(parameters - step)) / 2e-6
+        assert parameters.grad[i].item() == pytest.approx(difference.item(), rel=1e-5, abs=1e-8)
+    # Both d's mean and its deviation matter.
+    assert parameters.grad[2].abs() > 1e-3
+    assert parameters.grad[5].abs() > 1e-3
+
+
+def test_densities_against_a_change_of_variables():
+    """log π over the normalised box, for ω (tanh) and d (sigmoid), as the derivative of the inverse says."""
+    th.manual_seed(0)
+    policy = make(random_walk_like()).policy
+    obs = th.rand(64, 2) * 2 - 1
+    th.manual_seed(1)
+    options, log_prob = policy.actor.option_log_prob(obs)
+    mean, log_std = policy.actor.distribution_parameters(obs)
+    omega, d = options[:, :-1].double(), options[:, -1].double()
+    inverse = th.cat((th.atanh(omega), th.logit((d + 1) / 2)[:, None]), dim=1)
+    gaussian = Normal(mean.double(), log_std.double().exp()).log_prob(inverse)
+    # dω/dx = 1 − ω², and d/dx (2σ(x) − 1) = 2σ(1 − σ) = (1 − d²)/2
+    expected_omega = (gaussian[:, :-1] - th.log(1 - omega**2)).sum(dim=1)
+    expected_d = gaussian[:, -1] - th.log((1 - d**2) / 2)
+    th.testing.assert_close(log_prob[:, 0].double(), expected_omega, rtol=1e-4, atol=1e-4)
+    th.testing.assert_close(log_prob[:, 1].double(), expected_d, rtol=1e-4, atol=1e-4)
+
+
+def test_entropy_references():
+    # Uniform over [−1, 1]^6 and over [−1, 1]
+    th.testing.assert_close(
+        log_reference_density(6, 0.1, 1.0, "uniform"), th.tensor([-6 * math.log(2.0), -math.log(2.0)])
+    )
+    # The unit density over ω and over d in s: [0.1, 2.1] s is as long as [−1, 1].
+    th.testing.assert_close(log_reference_density(6, 0.1, 2.1, "paper"), th.zeros(2))
+    th.testing.assert_close(log_reference_density(6, 0.1, 0.6, "paper"), th.tensor([0.0, math.log(0.25)]))
+
+
+def test_a_decision_is_never_paid_for_its_entropy():
+    """Relative to the uniform distribution the expected cost is a KL divergence, at least 0."""
+    model = make(random_walk_like(), ent_coef=1.0, duration_ent_coef=1.0)
+    _, log_prob = model.actor.option_log_prob(th.zeros(4096, 2))
+    assert model.entropy_costs(log_prob).mean() > -0.05
+    # With the paper's density the same policy is paid at each decision.
+    model = make(random_walk_like(), ent_coef=1.0, duration_ent_coef=1.0, entropy_reference="paper")
+    assert model.entropy_costs(log_prob).mean() < -0.5
+
+
+def random_walk_like():
+    """Pendulum's shape is as good as any."""
+
+    class Env(gym.Env):
+        dt = 0.1
+        observation_space = spaces.Box(-1.0, 1.0, (2,), np.float32)
+        action_space = spaces.Box(-1.0, 1.0, (1,), np.float32)
+
+    return Env()
+
+
+# --- one update
+
+
+def batch_of(model, n=16):
+    th.manual_seed(3)
+    batch = model.replay_buffer.sample(n)
+    model.replay_buffer.sample = lambda *args, **kwargs: batch
+    return batch
+
+
+def test_one_update_by_hand(random_walk_env):
+    """The critic's loss that train logs, recomputed from the networks with β_h, γ(d) and both entropies."""
+    model = make(random_walk_env(), learning_starts=1000, learning_rate=0.0, ent_coef=0.2, duration_ent_coef=0.4)
+    model.learn(200)
+    # Let the targets differ from what they follow.
+    with th.no_grad():
+        for parameter in (*model.critic_target.parameters(), *model.actor_target.parameters()):
+            parameter.add_(0.1 * th.randn_like(parameter))
+    batch = batch_of(model)
+    th.manual_seed(0)
+    with th.no_grad():
+        options, log_prob = model.actor.option_log_prob(batch.observations)
+        next_options, next_log_prob = model.actor_target.option_log_prob(batch.next_observations)
+        cost = lambda p: 0.2 * (p[:, :1] + 3 * math.log(2)) + 0.4 * (p[:, 1:] + math.log(2))  # noqa: E731
+        next_q = model.critic_target(batch.next_observations, next_options).min(dim=0)[0]
+        bootstrap = (1 - batch.dones) * batch.discounts * (next_q - cost(next_log_prob))
+        target = batch.rewards - 0.05 + bootstrap
+        q_values = model.critic(batch.observations, batch.actions)
+        expected_critic = 0.5 * sum(((q - target) ** 2).mean() for q in q_values)
+        expected_actor = (cost(log_prob) - model.critic(batch.observations, options).min(dim=0)[0]).mean()
+    th.manual_seed(0)
+    model.train(1, 16)
+    assert model.logger.name_to_value["train/critic_loss"] == pytest.approx(expected_critic.item(), rel=1e-5)
+    assert model.logger.name_to_value["train/actor_loss"] == pytest.approx(expected_actor.item(), rel=1e-5)
+
+
+def test_the_penalty_is_a_number_or_a_schedule_and_needs_no_new_data(random_walk_env):
+    model = make(random_walk_env(), learning_starts=1000, learning_rate=0.0).learn(100)
+    batch = batch_of(model)
+
+    def loss(penalty):
+        model.high_freq_penalty = penalty
+        th.manual_seed(0)
+        model.train(1, 16)
+        return model.logger.name_to_value["train/critic_loss"], model.logger.name_to_value["option/high_freq_penalty"]
+
+    none, _ = loss(0.0)
+    one, logged = loss(1.0)
+    assert logged == 1.0
+    assert loss(lambda remaining: 1.0) == (one, 1.0)
+    # A quadratic in β_h whose second derivative is the number of critics: ½Σ(q − y + β)²
+    two, _ = loss(2.0)
+    assert two - 2 * one + none == pytest.approx(2.0, rel=1e-4)
+    assert len(batch.rewards) == 16
+
+
+def test_polyak_and_the_step_size_of_d(random_walk_env):
+    model = make(random_walk_env(), learning_starts=1000, tau=0.25, learning_rate=1e-2, duration_learning_rate=1e-5)
+    model.learn(100)
+    before = {name: p.clone() for name, p in model.policy.named_parameters()}
+    model.train(1, 16)
+    after = dict(model.policy.named_parameters())
+    for name in before:
+        if name.startswith("actor."):
+            target = name.replace("actor.", "actor_target.", 1)
+        elif name.startswith("critic."):
+            target = name.replace("critic.", "critic_target.", 1)
+        else:
+            continue
+        th.testing.assert_close(after[target], 0.75 * before[target] + 0.25 * after[name])
+    # Adam's first step is its step size, a parameter.
+    moved = lambda name: (after[name] - before[name]).abs().max().item()  # noqa: E731
+    assert moved("actor.omega_head.bias") == pytest.approx(1e-2, rel=0.01)
+    assert moved("actor.duration_head.bias") == pytest.approx(1e-5, rel=0.05)
+
+
+def test_temperatures(random_walk_env):
+    model = make(random_walk_env(), learning_starts=1000, ent_coef="auto_0.5", duration_ent_coef=0.3, learning_rate=0.1)
+    assert model.target_entropy == -3.0  # ω has three entries
+    assert model.duration_target_entropy == -1.0
+    model.learn(60)
+    before = model.log_ent_coefs.detach().exp().tolist()
+    assert before == pytest.approx([0.5, 0.3])
+    model.train(1, 8)
+    # A new policy is far more random than its target: its temperature falls by Adam's first step; a number stays.
+    after = model.log_ent_coefs.detach().tolist()
+    assert after[0] == pytest.approx(math.log(0.5) - 0.1, abs=1e-4)
+    assert after[1] == pytest.approx(math.log(0.3), abs=1e-6)
+    for ent_coef in (0, 0.0):
+        model = make(random_walk_env(), ent_coef=ent_coef, duration_ent_coef="auto").learn(60)
+        assert model.log_ent_coefs.detach().exp()[0] == 0.0
+        assert all(th.isfinite(p).all() for p in model.policy.parameters())
+
+
+@pytest.mark.parametrize("name", ["ent_coef", "duration_ent_coef"])
+@pytest.mark.parametrize("value", ["automatic", "auto_0", "auto_x", -0.1, math.nan])
+def test_bad_temperatures(random_walk_env, name, value):
+    with pytest.raises(ValueError, match=name):
+        make(random_walk_env(), **{name: value})
+
+
+# --- the special case: with one basis function and d = dt, it is SAC
+
+
+def test_options_of_one_step_are_sac(scripted_env):
+    """Transitions, discounts and critic targets equal those of plain SAC with γ = e^(−τ·dt) and scaled rewards."""
+    dt = 0.05
+    make_env = lambda: scripted_env(  # noqa: E731
+        rewards=lambda step, action: math.sin(step) + float(action[0]), dt=dt, truncate_at=30
+    )
+    model = make(
+        make_env(),
+        n_rbf=1,
+        d_min=dt,
+        d_max=dt,
+        high_freq_penalty=0.0,
+        entropy_reference="paper",
+        ent_coef=0.2,
+        learning_starts=1000,
+        learning_rate=0.0,
+    )
+    model.learn(100)
+    buffer = model.replay_buffer
+    assert buffer.pos == model.num_timesteps == 100
+
+    # The same actions in the bare environment
+    env, gamma = make_env(), math.exp(-DEFAULT_DISCOUNT_RATE * dt)
+    assert gamma == pytest.approx(0.98)
+    plain = ReplayBuffer(100, env.observation_space, env.action_space, device="cpu")
+    obs, _ = env.reset()
+    for i in range(100):
+        action = buffer.actions[i, 0, :1]
+        next_obs, reward, terminated, truncated, _ = env.step(action)
+        scaled = reward * step_weight(dt, DEFAULT_DISCOUNT_RATE)
+        done = terminated or truncated
+        plain.add(obs, next_obs, action, np.array([scaled]), np.array([done]), [{"TimeLimit.truncated": truncated}])
+        obs = env.reset()[0] if done else next_obs
+    np.testing.assert_array_equal(buffer.observations[:100], plain.observations)
+    np.testing.assert_array_equal(buffer.next_observations[:100], plain.next_observations)
+    np.testing.assert_array_equal(buffer.dones[:100], plain.dones)
+    np.testing.assert_array_equal(buffer.timeouts[:100], plain.timeouts)
+    np.testing.assert_allclose(buffer.integrated_rewards[:100], plain.rewards, atol=1e-6)
+
+    rows = np.arange(100)
+    ours, theirs = buffer._get_samples(rows), plain._get_samples(rows)
+    th.testing.assert_close(ours.discounts, th.full((100, 1), gamma), atol=1e-6, rtol=0)
+    with th.no_grad():
+        options, log_prob = model.actor_target.option_log_prob(ours.next_observations)
+        next_q = model.critic_target(ours.next_observations, options).amin(dim=0)
+        target = critic_target(ours.rewards, ours.dones, ours.discounts, next_q, model.entropy_costs(log_prob), 0.0)
+        # SAC's target, with the tanh Gaussian of the action alone
+        mean, log_std = model.actor_target.distribution_parameters(theirs.next_observations)
+        action = options[:, :1].double()
+        log_pi = Normal(mean[:, :1].double(), log_std[:, :1].double().exp()).log_prob(th.atanh(action)) - th.log(1 - action**2)
+        sac = theirs.rewards + (1 - theirs.dones) * gamma * (next_q - 0.2 * log_pi)
+    th.testing.assert_close(target.double(), sac, atol=2e-6, rtol=0)
+
+
+# --- environments
+
+
+def test_a_bare_environment_is_wrapped(random_walk_env):
+    model = make(random_walk_env(), n_rbf=2, d_max=0.7, gamma=0.9, gamma_dt=0.1)
+    settings = model.get_env().get_attr("option_settings")[0]
+    assert (settings.n_rbf, settings.d_max, settings.d_min, settings.dt) == (2, 0.7, 0.1, 0.1)
+    assert settings.discount_rate == pytest.approx(-math.log(0.9) / 0.1)
+    assert (model.dt, model.d_min) == (0.1, 0.1)
+    assert model.action_space.shape == (3,)
+
+
+def test_a_wrapped_environment_is_used_as_it_is(random_walk_env):
+    env = OptionExecutionWrapper(random_walk_env(), n_rbf=2, d_min=0.2, reward_unit="impulse")
+    model = make(env, n_rbf=2)
+    assert model.get_env().envs[0] is env
+    assert model.d_min == 0.2
+    model.learn(40)
+    # The Monitor that was missing stands inside, where it counts primitive steps.
+    assert model.ep_info_buffer[0]["l"] == 20
+
+
+@pytest.mark.parametrize(
+    ("wrapper", "algorithm", "name"),
+    [
+        ({"n_rbf": 2}, {}, "n_rbf"),
+        ({"d_max": 0.5}, {}, "d_max"),
+        ({"d_min": 0.2}, {"d_min": 0.3}, "d_min"),
+        ({}, {"dt": 0.2}, "dt"),
+        ({"discount_rate": 0.1}, {}, "discount_rate"),
+        ({}, {"gamma": 0.99}, "discount_rate"),
+    ],
+)
+def test_disagreeing_settings_are_refused(random_walk_env, wrapper, algorithm, name):
+    with pytest.raises(ValueError, match=f"options have {name}="):
+        make(OptionExecutionWrapper(random_walk_env(), **wrapper), **algorithm)
+
+
+def test_environments_that_disagree_among_themselves(random_walk_env):
+    env = DummyVecEnv([lambda d=d: OptionExecutionWrapper(random_walk_env(), d_min=d) for d in (0.1, 0.2)])
+    with pytest.raises(ValueError, match="d_min"):
+        make(env)
+
+
+@pytest.mark.parametrize("vec_env_cls", [DummyVecEnv, SubprocVecEnv])
+def test_several_wrapped_environments(vec_env_cls, random_walk_env):
+    env = make_vec_env(random_walk_env, n_envs=2, wrapper_class=OptionExecutionWrapper, vec_env_cls=vec_env_cls, seed=0)
+    model = make(env).learn(120)
+    assert model.replay_buffer.n_envs == 2
+    assert model._n_updates > 0
+    env.close()
+
+
+def test_a_vec_env_of_bare_environments_is_refused(random_walk_env):
+    with pytest.raises(ValueError, match="wrapper_class=OptionExecutionWrapper"):
+        make(make_vec_env(random_walk_env, n_envs=2))
+
+
+@pytest.mark.parametrize("kind", ["image", "dict"])
+@pytest.mark.parametrize("share", [False, True])
+def test_images_and_dictionaries_are_trained(random_walk_env, kind, share):
+    model = CTCO(
+        {"image": "CnnPolicy", "dict": "MultiInputPolicy"}[kind],
+        random_walk_env(kind),
+        policy_kwargs={"net_arch": [8], "share_features_extractor": share},
+        buffer_size=200,
+        batch_size=8,
+        learning_starts=20,
+        gradient_steps=1,
+        seed=0,
+    )
+    before = [p.clone() for p in model.actor.parameters()]
+    model.learn(60)
+    assert isinstance(model.replay_buffer, DictOptionReplayBuffer if kind == "dict" else OptionReplayBuffer)
+    assert any(not th.equal(p, q) for p, q in zip(before, model.actor.parameters(), strict=True))
+    option, _ = model.predict(model.get_env().reset())
+    assert option.shape == (1, 4)
+
+
+def test_vec_normalize(random_walk_env):
+    bare = make_vec_env(random_walk_env, wrapper_class=OptionExecutionWrapper)
+    with pytest.raises(ValueError, match="norm_reward=False"):
+        make(VecNormalize(bare))
+    model = make(VecNormalize(bare, norm_reward=False)).learn(80)
+    sample = model.replay_buffer.sample(32, env=model.get_vec_normalize_env())
+    assert sample.observations.abs().max() > model.replay_buffer.sample(32).observations.abs().max()
+
+
+def test_action_noise(random_walk_env):
+    make(random_walk_env(), action_noise=NormalActionNoise(np.zeros(4), 0.1 * np.ones(4))).learn(60)
+
+
+# --- bad input
+
+
+@pytest.mark.parametrize(
+    ("kwargs", "message"),
+    [
+        ({"d_max": 0.0}, "d_max"),
+        ({"d_max": -1.0}, "d_max"),
+        ({"d_min": 2.0}, "d_min"),
+        ({"n_rbf": 0}, "n_rbf"),
+        ({"gamma": 0.0}, "gamma"),
+        ({"gamma": 1.5}, "gamma"),
+        ({"gamma_dt": 0.0}, "gamma_dt"),
+        ({"entropy_reference": "gaussian"}, "entropy_reference"),
+        ({"replay_buffer_class": ReplayBuffer}, "OptionReplayBuffer"),
+        ({"replay_buffer_kwargs": {"optimize_memory_usage": True}}, "optimize_memory_usage"),
+        ({"policy_kwargs": {"n_critics": 0}}, "n_critics"),
+        ({"policy_kwargs": {"use_sde": True}}, "State-Dependent"),
+    ],
+)
+def test_bad_settings(random_walk_env, kwargs, message):
+    with pytest.raises((ValueError, TypeError), match=message):
+        make(random_walk_env(), **kwargs)
+
+
+def test_bad_action_spaces(scripted_env):
+    with pytest.raises(TypeError, match="Box action space"):
+        make(scripted_env(action_space=spaces.Discrete(2)))
+    with pytest.raises(ValueError, match="finite action bounds"):
+        make(scripted_env(action_space=spaces.Box(-np.inf, np.inf, (1,))))
+    with pytest.raises(ValueError, match="pass dt"):
+        make(scripted_env(dt=None))
+    assert make(scripted_env(dt=None), dt=0.5).dt == 0.5
+
+
+@pytest.mark.parametrize("bad", ["nan reward", "inf reward", "nan observation", "error"])
+def test_a_bad_environment_leaves_no_trace_in_the_buffer(scripted_env, bad):
+    class Env(scripted_env):
+        broken = True
+
+        def step(self, action):
+            obs, reward, terminated, truncated, info = super().step(action)
+            if self.count == 15 and self.broken:
+                if bad == "error":
+                    raise RuntimeError("the motor is hot")
+                if bad == "nan observation":
+                    obs = obs * np.nan
+                else:
+                    reward = float(bad.split()[0])
+            return obs, reward, terminated, truncated, info
+
+    env = Env(truncate_at=20)
+    model = make(env, d_max=0.5, learning_starts=1000)
+    with pytest.raises((RuntimeError, ValueError), match="the motor is hot|not finite"):
+        model.learn(100)
+    buffer = model.replay_buffer
+    stored = buffer.pos
+    # Everything before the broken option, nothing of it.
+    np.testing.assert_array_equal(buffer.next_observations[: stored - 1], buffer.observations[1:stored])
+    assert 0 < buffer.next_observations[stored - 1, 0, 0] < 15
+    assert (buffer.durations[stored:] == 0).all()
+    # Repaired, learning goes on from a reset: no transition spans the break.
+    env.broken = False
+    model.learn(10, reset_num_timesteps=False)
+    assert buffer.observations[stored, 0, 0] == 0
+
+
+# --- save and load
+
+
+def test_save_and_load(tmp_path, random_walk_env):
+    model = make(random_walk_env(), n_rbf=2, d_max=0.7, d_min=0.2, ent_coef=0.1, duration_learning_rate=1e-4).learn(60)
+    model.save(tmp_path / "model")
+    obs = np.random.default_rng(0).uniform(-1, 1, (20, 2)).astype(np.float32)
+    expected, _ = model.predict(obs, deterministic=True)
+
+    alone = CTCO.load(tmp_path / "model")
+    np.testing.assert_array_equal(alone.predict(obs, deterministic=True)[0], expected)
+    assert (alone.dt, alone.d_min, alone.d_max, alone.n_rbf) == (0.1, 0.2, 0.7, 2)
+    alone.set_env(random_walk_env())
+    alone.learn(30)
+
+    bare = CTCO.load(tmp_path / "model", env=random_walk_env())
+    np.testing.assert_array_equal(bare.predict(obs, deterministic=True)[0], expected)
+    assert bare.get_env().get_attr("option_settings")[0].d_max == 0.7
+
+    wrapped = OptionExecutionWrapper(random_walk_env(), n_rbf=2, d_max=0.7, d_min=0.2)
+    CTCO.load(tmp_path / "model", env=wrapped).learn(30)
+    two = make_vec_env(
+        random_walk_env,
+        n_envs=2,
+        wrapper_class=OptionExecutionWrapper,
+        wrapper_kwargs={"n_rbf": 2, "d_max": 0.7, "d_min": 0.2},
+    )
+    assert CTCO.load(tmp_path / "model", env=two).learn(30).replay_buffer.n_envs == 2
+
+    for other in ({"n_rbf": 2, "d_max": 0.6, "d_min": 0.2}, {"n_rbf": 2, "d_max": 0.7}):
+        with pytest.raises(ValueError, match="options have d_m"):
+            CTCO.load(tmp_path / "model", env=OptionExecutionWrapper(random_walk_env(), **other))
+        with pytest.raises(ValueError, match="options have d_m"):
+            alone.set_env(OptionExecutionWrapper(random_walk_env(), **other))
+    faster = random_walk_env()
+    faster.dt = 0.05
+    with pytest.raises(ValueError, match="options have dt=0.05"):
+        CTCO.load(tmp_path / "model", env=faster)
+    # On purpose, the same policy runs at another rate.
+    assert CTCO.load(tmp_path / "model", env=faster, dt=0.05).learn(30).num_timesteps >= 30
+
+
+def test_everything_that_is_learned_is_saved(tmp_path, random_walk_env):
+    model = make(random_walk_env(), learning_rate=1e-2).learn(60)
+    model.save(tmp_path / "model")
+    loaded = CTCO.load(tmp_path / "model", env=random_walk_env())
+    for name, value in model.policy.state_dict().items():
+        th.testing.assert_close(loaded.policy.state_dict()[name], value)
+    th.testing.assert_close(loaded.log_ent_coefs.detach(), model.log_ent_coefs.detach())
+    assert not th.equal(loaded.log_ent_coefs.detach(), th.zeros(2))
+    for one, other in (
+        (loaded.actor.optimizer, model.actor.optimizer),
+        (loaded.critic.optimizer, model.critic.optimizer),
+        (loaded.ent_coef_optimizer, model.ent_coef_optimizer),
+    ):
+        for left, right in zip(one.state_dict()["state"].values(), other.state_dict()["state"].values(), strict=True):
+            th.testing.assert_close(left["exp_avg"], right["exp_avg"])
+            assert left["step"] == right["step"] > 0
+    # Learning moves what was loaded: temperatures and networks are those that the optimizers hold.
+    before = loaded.log_ent_coefs.detach().clone()
+    loaded.learn(40)
+    assert not th.equal(loaded.log_ent_coefs.detach(), before)
+
+
+def test_training_continues_from_a_saved_model_and_buffer(tmp_path, random_walk_env):
+    model = make(random_walk_env()).learn(60)
+    model.save(tmp_path / "model")
+    model.save_replay_buffer(tmp_path / "buffer")
+    loaded = CTCO.load(tmp_path / "model", env=random_walk_env())
+    loaded.load_replay_buffer(tmp_path / "buffer")
+    stored = loaded.replay_buffer.pos
+    assert stored == model.replay_buffer.pos
+    updates = loaded._n_updates
+    loaded.learn(40, reset_num_timesteps=False)
+    assert loaded.num_timesteps >= model.num_timesteps + 40
+    assert loaded.replay_buffer.pos > stored
+    assert loaded._n_updates > updates
+    # The policy alone
+    model.policy.save(tmp_path / "policy")
+    policy = CTCOPolicy.load(tmp_path / "policy")
+    obs = np.zeros((1, 2), dtype=np.float32)
+    np.testing.assert_array_equal(policy.predict(obs, deterministic=True)[0], model.predict(obs, deterministic=True)[0])
+
+
+def test_same_seed_same_result(random_walk_env):
+    def run(seed):
+        model = make(random_walk_env(), seed=seed).learn(120)
+        return th.cat([p.detach().ravel() for p in model.policy.parameters()])
+
+    first = run(1)
+    assert th.equal(first, run(1))
+    assert not th.equal(first, run(2))
+
+
+# --- networks
+
+
+def test_ensemble_linear_is_several_linear_layers():
+    th.manual_seed(0)
+    layer = EnsembleLinear(3, 4, 5)
+    x = th.randn(3, 7, 4)
+    out = layer(x)
+    assert out.shape == (3, 7, 5)
+    for i in range(3):
+        th.testing.assert_close(out[i], x[i] @ layer.weight[i] + layer.bias[i])
+    assert layer.weight.abs().max() <= 0.5  # 1/√4, as nn.Linear
+    assert layer.weight.std().item() == pytest.approx(0.5 / math.sqrt(3), rel=0.2)
+
+
+def test_one_critic_on_request(random_walk_env):
+    model = make(random_walk_env(), policy_kwargs={"net_arch": [8], "n_critics": 1}).learn(40)
+    assert model.critic(th.zeros(5, 2), th.zeros(5, 4)).shape == (1, 5, 1)
+
+
+def test_greedy_options_are_the_means(random_walk_env):
+    model = make(random_walk_env())
+    obs = np.array([[0.3, 0.1]], dtype=np.float32)
+    mean = model.actor.distribution_parameters(th.as_tensor(obs))[0][0].detach().numpy()
+    expected = np.append(np.tanh(mean[:-1]), 2 / (1 + math.exp(-mean[-1])) - 1)
+    np.testing.assert_allclose(model.predict(obs, deterministic=True)[0][0], expected, rtol=1e-5)
+    assert not np.allclose(model.predict(obs)[0], model.predict(obs)[0])
+
+
+def test_docstrings_run():
+    import doctest
+
+    import sb3_ctco.wrappers.option_execution as module
+
+    result = doctest.testmod(module)
+    assert result.attempted > 3
+    assert result.failed == 0

@@ -1,0 +1,342 @@
+import math
+
+import gymnasium as gym
+import numpy as np
+import pytest
+from gymnasium import spaces
+from gymnasium.error import ResetNeeded
+from gymnasium.utils.env_checker import check_env as gymnasium_check_env
+from gymnasium.wrappers import RecordVideo, TimeLimit, TransformReward
+from stable_baselines3.common.env_checker import check_env as sb3_check_env
+from stable_baselines3.common.env_util import make_vec_env
+from stable_baselines3.common.evaluation import evaluate_policy
+from stable_baselines3.common.monitor import Monitor
+
+from sb3_ctco.options import action_plan
+from sb3_ctco.wrappers import OptionExecutionWrapper, SupportsStepSequence, find_dt
+
+TAU = math.log(2.0)  # half in a second
+
+
+def wrap(env, **kwargs):
+    return OptionExecutionWrapper(env, **{"n_rbf": 1, "d_max": 1.0, "discount_rate": TAU, **kwargs})
+
+
+# --- one decision
+
+
+def test_an_option_by_hand(scripted_env):
+    # d = 0 is the middle of [0.1, 0.5] s: 0.3 s, three steps of 0.1 s, paid 0, 1, 2
+    env = wrap(scripted_env(rewards=lambda step, action: float(step)), d_min=0.1, d_max=0.5)
+    env.reset()
+    obs, reward, terminated, truncated, info = env.step([0.25, 0.0])
+    assert obs[0] == 3
+    assert (reward, terminated, truncated) == (3.0, False, False)
+    option = info["option"]
+    assert option["n_steps"] == 3
+    assert option["duration"] == pytest.approx(0.3)
+    assert option["discount"] == pytest.approx(0.5**0.3)
+    weight = (1 - 0.5**0.1) / TAU
+    assert option["integrated_reward"] == pytest.approx(weight * (1 * 0.5**0.1 + 2 * 0.5**0.2))
+    assert info["count"] == 3
+    np.testing.assert_allclose(np.ravel(env.unwrapped.actions), [0.25, 0.25, 0.25])
+    # Scalars only: Stable-Baselines3 copies infos deeply.
+    assert all(type(value) in (int, float) for value in option.values())
+
+
+def test_reward_kinds(scripted_env):
+    def play(**kwargs):
+        env = wrap(scripted_env(rewards=lambda step, action: 2.0), d_min=0.2, d_max=0.2, **kwargs)
+        env.reset()
+        _, reward, _, _, info = env.step([0.0, 0.7])
+        return reward, info["option"]["integrated_reward"]
+
+    rate = 2.0 * (1 - 0.5**0.2) / TAU
+    impulse = 2.0 * (1 + 0.5**0.1)
+    assert play() == (4.0, pytest.approx(rate))
+    assert play(reward="integral") == (pytest.approx(rate), pytest.approx(rate))
+    assert play(reward="integral", reward_unit="impulse") == (pytest.approx(impulse), pytest.approx(impulse))
+
+
+def test_actions_are_mapped_to_the_bounds_of_any_shape(scripted_env):
+    low = np.array([[0.0, -3.0], [5.0, -1.0]], dtype=np.float32)
+    high = np.array([[1.0, 3.0], [6.0, 0.0]], dtype=np.float32)
+    env = wrap(scripted_env(action_space=spaces.Box(low, high)), n_rbf=2, d_max=0.3)
+    assert env.action_space.shape == (9,)
+    env.reset()
+    env.step(np.concatenate([np.ones(8), [1.0]]))
+    for action in env.unwrapped.actions:
+        np.testing.assert_array_equal(action, high)
+        assert action.dtype == np.float32
+    env.step(np.concatenate([-np.ones(8), [1.0]]))
+    np.testing.assert_array_equal(env.unwrapped.actions[-1], low)
+    # ω is [action_dim, n_rbf] flattened: the first two weights drive the first action entry, halfway up its range.
+    omega = np.array([[0.0, 0.0], [1.0, -1.0], [0.0, 0.0], [0.0, 0.0]])
+    env.step(np.concatenate([omega.ravel(), [1.0]]))
+    plan = action_plan(omega, 3)
+    for action, expected in zip(env.unwrapped.actions[-3:], plan, strict=True):
+        np.testing.assert_allclose(action, [[0.5, 3.0 * expected[1]], [5.5, -0.5]], rtol=1e-6)
+
+
+def test_entries_outside_the_box_are_clipped(scripted_env):
+    env = wrap(scripted_env(), d_max=0.2)
+    env.reset()
+    _, _, _, _, info = env.step([7.0, 1.5])
+    assert info["option"]["n_steps"] == 2
+    np.testing.assert_array_equal(np.ravel(env.unwrapped.actions), [1.0, 1.0])
+
+
+# --- the end of an episode
+
+
+@pytest.mark.parametrize("kind", ["terminate_at", "truncate_at"])
+def test_an_option_stops_at_the_end_of_the_episode(scripted_env, kind):
+    env = wrap(scripted_env(**{kind: 3}), d_max=1.0)
+    env.reset()
+    obs, reward, terminated, truncated, info = env.step([0.0, 1.0])  # asks for ten steps
+    assert obs[0] == 3
+    assert (terminated, truncated) == (kind == "terminate_at", kind == "truncate_at")
+    assert info["option"]["n_steps"] == 3
+    assert info["option"]["duration"] == pytest.approx(0.3)
+    assert info["option"]["discount"] == pytest.approx(0.5**0.3)
+    assert reward == 3.0
+    with pytest.raises(ResetNeeded, match="reset"):
+        env.step([0.0, 1.0])
+    env.reset()
+    assert env.step([0.0, -1.0])[4]["option"]["n_steps"] == 1
+
+
+def test_fixed_duration(scripted_env):
+    env = wrap(scripted_env(), d_min=0.4, d_max=0.4)
+    env.reset()
+    for entry in (-1.0, 0.3, 1.0):
+        assert env.step([0.0, entry])[4]["option"]["n_steps"] == 4
+
+
+def test_step_before_reset(scripted_env):
+    with pytest.raises(ResetNeeded, match="reset"):
+        wrap(scripted_env()).step([0.0, 0.0])
+
+
+# --- bad input
+
+
+def test_other_action_spaces_are_refused(scripted_env):
+    with pytest.raises(TypeError, match="Box"):
+        wrap(scripted_env(action_space=spaces.Discrete(3)))
+    with pytest.raises(ValueError, match="finite action bounds"):
+        wrap(scripted_env(action_space=spaces.Box(-np.inf, np.inf, (2,))))
+
+
+@pytest.mark.parametrize(
+    ("kwargs", "message"),
+    [
+        ({"d_max": 0.0}, "d_max"),
+        ({"d_min": 0.5, "d_max": 0.2}, "d_min"),
+        ({"d_max": 0.05}, "d_min=0.1 s is longer than d_max=0.05 s"),
+        ({"n_rbf": 0}, "n_rbf"),
+        ({"discount_rate": -1.0}, "discount_rate"),
+        ({"reward": "mean"}, "'sum' or 'integral', not 'mean'"),
+        ({"reward_unit": "metres"}, "not 'metres'"),
+        ({"dt": -0.1}, "dt"),
+    ],
+)
+def test_bad_settings(scripted_env, kwargs, message):
+    with pytest.raises(ValueError, match=message):
+        wrap(scripted_env(), **kwargs)
+
+
+@pytest.mark.parametrize("bad", [np.nan, np.inf])
+def test_bad_rewards_and_observations(scripted_env, bad):
+    env = wrap(scripted_env(rewards=lambda step, action: bad if step == 1 else 0.0), d_max=0.5)
+    env.reset()
+    with pytest.raises(ValueError, match="reward that is not finite"):
+        env.step([0.0, 1.0])
+    with pytest.raises(ResetNeeded):  # the option was half played
+        env.step([0.0, 1.0])
+
+    env = wrap(scripted_env(), d_max=0.5)
+    env.reset()
+    env.unwrapped._obs = lambda: np.array([bad, 0.0], dtype=np.float32)
+    with pytest.raises(ValueError, match="observation that is not finite"):
+        env.step([0.0, 1.0])
+
+
+@pytest.mark.parametrize("option", [[0.0], [0.0, 0.0, 0.0], [np.nan, 0.0], [0.0, np.inf]])
+def test_bad_options(scripted_env, option):
+    env = wrap(scripted_env())
+    env.reset()
+    with pytest.raises(ValueError, match="an option"):
+        env.step(option)
+    env.step([0.0, 0.0])  # nothing was played, so the episode goes on
+
+
+def test_an_error_in_the_middle_of_an_option_needs_a_reset(scripted_env):
+    def rewards(step, action):
+        if step == 2:
+            raise RuntimeError("the motor is hot")
+        return 0.0
+
+    env = wrap(scripted_env(rewards=rewards), d_max=0.5)
+    env.reset()
+    with pytest.raises(RuntimeError, match="the motor is hot"):
+        env.step([0.0, 1.0])
+    with pytest.raises(ResetNeeded):
+        env.step([0.0, 1.0])
+    env.reset()
+    env.step([0.0, -1.0])
+
+
+# --- dt
+
+
+def test_dt_is_found(scripted_env):
+    assert find_dt(scripted_env(dt=0.25)) == 0.25
+    env = scripted_env(dt=None)
+    env.control_timestep = lambda: 0.125
+    env.metadata = {"render_fps": 50}
+    assert find_dt(env) == 0.125
+    del env.control_timestep
+    assert find_dt(env) == pytest.approx(0.02)
+    assert find_dt(gym.make("Pendulum-v1")) == pytest.approx(0.05)
+    # An explicit dt goes before everything found.
+    assert wrap(env, dt=0.5).option_settings.dt == 0.5
+
+
+def test_dt_that_is_not_found(scripted_env):
+    with pytest.raises(ValueError, match="pass dt"):
+        wrap(scripted_env(dt=None))
+
+
+# --- among other wrappers
+
+
+class SequenceEnv(gym.Wrapper):
+    """Offers step_sequence and counts its calls."""
+
+    calls = 0
+
+    def step_sequence(self, actions):
+        self.calls += 1
+        rewards = []
+        for action in actions:
+            obs, reward, terminated, truncated, info = self.env.step(action)
+            rewards.append(reward)
+            if terminated or truncated:
+                break
+        return obs, rewards, terminated, truncated, info
+
+
+def play_random(env, n_options=60):
+    env.action_space.seed(0)
+    obs, _ = env.reset(seed=0)
+    trace = [obs]
+    for _ in range(n_options):
+        obs, reward, terminated, truncated, info = env.step(env.action_space.sample())
+        info = {key: value for key, value in info.items() if key != "episode"} | {
+            key: info["episode"][key] for key in ("r", "l") if "episode" in info
+        }
+        trace.append((obs, reward, terminated, truncated, info))
+        if terminated or truncated:
+            env.reset()
+    return trace
+
+
+def assert_same_trace(left, right):
+    for one, other in zip(left, right, strict=True):
+        np.testing.assert_equal(one, other)
+
+
+@pytest.mark.parametrize("end", [{"terminate_at": 25}, {"truncate_at": 25}])
+def test_step_sequence_is_used_below_monitor_and_changes_nothing(scripted_env, end):
+    def rewards(step, action):
+        return 0.5 * step - float(action[0])
+
+    plain = Monitor(scripted_env(rewards=rewards, **end))
+    sequence = SequenceEnv(scripted_env(rewards=rewards, **end))
+    assert isinstance(sequence, SupportsStepSequence)
+    fast = Monitor(sequence)
+    assert_same_trace(play_random(wrap(plain)), play_random(wrap(fast)))
+    assert sequence.calls == 60
+    assert fast.get_episode_rewards() == plain.get_episode_rewards()
+    assert fast.get_episode_lengths() == plain.get_episode_lengths() == [25] * len(plain.get_episode_lengths())
+    assert fast.get_total_steps() == plain.get_total_steps()
+
+
+def test_a_wrapper_that_looks_at_each_step_gets_to_see_it(scripted_env):
+    sequence = SequenceEnv(scripted_env())
+    env = wrap(TransformReward(sequence, lambda reward: 10.0 * reward), d_max=0.5)
+    env.reset()
+    assert env.step([0.0, 1.0])[1] == 50.0
+    assert sequence.calls == 0
+
+
+def test_monitor_counts_primitive_steps():
+    env = OptionExecutionWrapper(Monitor(gym.make("Pendulum-v1")))
+    env.reset(seed=0)
+    n_steps, total = 0, 0.0
+    truncated = False
+    while not truncated:
+        _, reward, _, truncated, info = env.step(env.action_space.sample())
+        n_steps += info["option"]["n_steps"]
+        total += reward
+    assert info["episode"]["l"] == n_steps == 200
+    assert info["episode"]["r"] == pytest.approx(total, abs=1e-4)
+
+
+def test_evaluate_policy_reports_primitive_steps():
+    class RandomPolicy:
+        def predict(self, obs, state=None, episode_start=None, deterministic=False):
+            return np.zeros((1, 4), dtype=np.float32), None
+
+    env = make_vec_env("Pendulum-v1", wrapper_class=OptionExecutionWrapper)
+    _, lengths = evaluate_policy(RandomPolicy(), env, n_eval_episodes=2, return_episode_rewards=True)
+    assert lengths == [200, 200]
+
+
+def test_a_video_keeps_every_primitive_frame(tmp_path, scripted_env):
+    class Rendered(scripted_env):
+        metadata = {"render_modes": ["rgb_array"], "render_fps": 10}  # noqa: RUF012
+        render_mode = "rgb_array"
+
+        def render(self):
+            return np.full((32, 32, 3), self.count, dtype=np.uint8)
+
+    video = RecordVideo(Rendered(truncate_at=12), str(tmp_path), episode_trigger=lambda episode: True, disable_logger=True)
+    env = wrap(video, d_max=0.5)
+    env.reset()
+    truncated = False
+    while not truncated:
+        _, _, _, truncated, _ = env.step([0.0, 1.0])
+    # One frame of the reset and one of each step, though only three options were played.
+    assert [frame[0, 0, 0] for frame in video.recorded_frames] == list(range(13))
+    env.close()
+    assert len(list(tmp_path.glob("*.mp4"))) == 1
+    import moviepy
+
+    clip = moviepy.VideoFileClip(str(next(tmp_path.glob("*.mp4"))))
+    assert clip.n_frames == 13
+    clip.close()
+
+
+@pytest.mark.parametrize("n_rbf", [1, 3])
+def test_env_checkers(n_rbf):
+    sb3_check_env(OptionExecutionWrapper(gym.make("Pendulum-v1"), n_rbf=n_rbf), warn=True)
+    gymnasium_check_env(OptionExecutionWrapper(gym.make("Pendulum-v1").unwrapped, n_rbf=n_rbf), skip_render_check=True)
+
+
+def test_the_spec_rebuilds_the_environment():
+    env = OptionExecutionWrapper(gym.make("Pendulum-v1"), n_rbf=2, d_max=0.5, reward="integral")
+    again = gym.make(env.spec)
+    assert isinstance(again, OptionExecutionWrapper)
+    assert again.option_settings == env.option_settings
+    assert again.reward == "integral"
+
+
+def test_time_limit_inside_counts_primitive_steps(scripted_env):
+    env = wrap(TimeLimit(scripted_env(), max_episode_steps=7), d_max=0.5)
+    env.reset()
+    assert env.step([0.0, 1.0])[3] is False
+    _, _, _, truncated, info = env.step([0.0, 1.0])
+    assert truncated
+    assert info["option"]["n_steps"] == 2

@@ -1,0 +1,177 @@
+import math
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from hypothesis.extra import numpy as hnp
+
+from sb3_ctco.options import (
+    DEFAULT_DISCOUNT_RATE,
+    OptionSettings,
+    action_plan,
+    basis,
+    basis_of_steps,
+    discount,
+    discount_rate_from_gamma,
+    integrated_reward,
+    step_weight,
+    steps_in,
+)
+
+# --- basis, worked by hand from centres linspace(−0.5/n, 1 + 0.5/n, n) and variance ½((1 + 1/n)/n)²
+
+
+def test_one_basis_function_is_constant():
+    np.testing.assert_array_equal(basis(np.array([0.0, 0.3, 0.99]), 1), np.ones((3, 1)))
+
+
+def test_two_basis_functions():
+    # Centres −0.25 and 1.25, variance ½·0.75² = 0.28125: at x = 0 the exponents are −0.0625/0.5625 and −1.5625/0.5625.
+    a, b = math.exp(-1 / 9), math.exp(-25 / 9)
+    # At x = 0.5 both are equally far.
+    expected = [[a / (a + b), b / (a + b)], [0.5, 0.5]]
+    np.testing.assert_allclose(basis(np.array([0.0, 0.5]), 2), expected, rtol=1e-12)
+
+
+def test_three_basis_functions():
+    # Centres −1/6, 1/2, 7/6, variance ½·(4/9)², so φ ∝ exp(−(x − c)²·81/16).
+    e = [math.exp(-((0.25 - c) ** 2) * 81 / 16) for c in (-1 / 6, 1 / 2, 7 / 6)]
+    np.testing.assert_allclose(basis(np.array([0.25]), 3), [[x / sum(e) for x in e]], rtol=1e-12)
+    # By symmetry about x = 1/2.
+    np.testing.assert_allclose(basis(np.array([0.25]), 3)[0], basis(np.array([0.75]), 3)[0, ::-1], rtol=1e-12)
+
+
+def test_basis_of_steps_are_the_phases_k_over_n():
+    np.testing.assert_array_equal(basis_of_steps(4, 3), basis(np.array([0.0, 0.25, 0.5, 0.75]), 3))
+    with pytest.raises(ValueError, match="read-only"):
+        basis_of_steps(4, 3)[0, 0] = 1.0
+
+
+def test_plan_of_two_dimensions_by_hand():
+    omega = np.array([[1.0, -1.0], [0.5, 0.5]])
+    a, b = math.exp(-1 / 9), math.exp(-25 / 9)
+    # Steps at phases 0 and 0.5; equal weights give a constant.
+    np.testing.assert_allclose(action_plan(omega, 2), [[(a - b) / (a + b), 0.5], [0.0, 0.5]], atol=1e-12)
+
+
+@given(
+    hnp.arrays(np.float64, st.tuples(st.integers(1, 4), st.integers(1, 8)), elements=st.floats(-1, 1)),
+    st.integers(1, 300),
+)
+def test_actions_stay_in_the_box_of_the_weights(omega, n_steps):
+    plan = action_plan(omega, n_steps)
+    assert plan.shape == (n_steps, omega.shape[0])
+    assert (plan <= omega.max(axis=1) + 1e-12).all()
+    assert (plan >= omega.min(axis=1) - 1e-12).all()
+    np.testing.assert_allclose(basis_of_steps(n_steps, omega.shape[1]).sum(axis=1), 1.0)
+
+
+# --- discount and integrated reward
+
+
+def test_discount_rate_is_the_papers():
+    assert pytest.approx(0.40405, abs=1e-5) == DEFAULT_DISCOUNT_RATE
+    assert discount_rate_from_gamma(1.0, 0.05) == 0.0
+    # 0.98 over 0.05 s is 0.98² over 0.1 s.
+    assert float(discount(0.1, DEFAULT_DISCOUNT_RATE)) == pytest.approx(0.98**2)
+
+
+@pytest.mark.parametrize(("gamma", "gamma_dt"), [(0.0, 0.05), (1.1, 0.05), (-0.5, 0.05), (0.98, 0.0), (0.98, math.inf)])
+def test_discount_rate_out_of_range(gamma, gamma_dt):
+    with pytest.raises(ValueError, match="must be"):
+        discount_rate_from_gamma(gamma, gamma_dt)
+
+
+def test_integrated_reward_by_hand():
+    # Two steps of 0.5 s at τ = ln 4 /s discount by ½ each: (1 − ½)/ln 4 = 0.5/ln 4 is the weight of a step.
+    tau = math.log(4.0)
+    assert step_weight(0.5, tau) == pytest.approx(0.5 / tau)
+    assert integrated_reward(np.array([2.0, 6.0]), 0.5, tau) == pytest.approx((2 + 6 * 0.5) * 0.5 / tau)
+    assert integrated_reward(np.array([2.0, 6.0]), 0.5, tau, "impulse") == pytest.approx(2 + 6 * 0.5)
+    # Without discounting a rate is held for dt.
+    assert integrated_reward(np.array([2.0, 6.0]), 0.5, 0.0) == pytest.approx(4.0)
+
+
+@pytest.mark.parametrize("dt", [0.1, 0.01, 0.002])
+def test_a_constant_rate_is_integrated_exactly_at_any_dt(dt):
+    tau, duration = 0.404, 0.8
+    exact = (1 - math.exp(-tau * duration)) / tau
+    assert integrated_reward(np.ones(round(duration / dt)), dt, tau) == pytest.approx(exact, rel=1e-12)
+
+
+@pytest.mark.parametrize("a", [0.7, -1.5, 0.404])
+def test_an_exponential_rate_converges_to_its_closed_form(a):
+    # ∫₀¹ e^((a−τ)t) dt
+    tau = 0.404
+    exact = 1.0 if a == tau else (math.exp(a - tau) - 1) / (a - tau)
+    errors = []
+    for n in (50, 100, 200, 400):
+        t = np.arange(n) / n
+        errors.append(abs(integrated_reward(np.exp(a * t), 1 / n, tau) - exact))
+    assert errors[-1] < 2e-3
+    # First order: halving dt halves the error.
+    for coarse, fine in zip(errors, errors[1:], strict=False):
+        assert fine == pytest.approx(coarse / 2, rel=0.05)
+
+
+@given(
+    hnp.arrays(np.float64, st.integers(1, 50), elements=st.floats(-100, 100)),
+    st.floats(-10, 10),
+    st.sampled_from(["rate", "impulse"]),
+)
+def test_the_integral_scales_with_the_reward(rewards, factor, unit):
+    once = integrated_reward(rewards, 0.02, 0.404, unit)
+    assert integrated_reward(factor * rewards, 0.02, 0.404, unit) == pytest.approx(factor * once, rel=1e-9, abs=1e-6)
+
+
+@given(hnp.arrays(np.float64, 20, elements=st.floats(-10, 10)), st.integers(1, 19))
+def test_options_in_a_row_add_up_to_the_whole(rewards, cut):
+    dt, tau = 0.05, 0.404
+    first, second = integrated_reward(rewards[:cut], dt, tau), integrated_reward(rewards[cut:], dt, tau)
+    whole = integrated_reward(rewards, dt, tau)
+    assert first + float(discount(cut * dt, tau)) * second == pytest.approx(whole, abs=1e-9)
+
+
+# --- settings
+
+
+@pytest.mark.parametrize(
+    ("duration", "dt", "expected"),
+    [(0.1, 0.1, 1), (0.04, 0.1, 1), (0.24, 0.1, 2), (0.25, 0.1, 3), (0.3, 0.1, 3), (1.0, 0.002, 500), (0.001, 0.002, 1)],
+)
+def test_durations_are_rounded_half_up_to_at_least_one_step(duration, dt, expected):
+    assert steps_in(duration, dt) == expected
+
+
+def test_decode():
+    settings = OptionSettings(n_rbf=2, d_max=1.0, d_min=0.2, dt=0.1, discount_rate=0.4)
+    omega, n_steps = settings.decode(np.array([0.1, 0.2, 0.3, 0.4, 0.0]))
+    np.testing.assert_array_equal(omega, [[0.1, 0.2], [0.3, 0.4]])
+    assert n_steps == 6  # the middle of [0.2, 1.0] s
+    assert settings.duration(np.array([-1.0])) == pytest.approx(0.2)
+    assert settings.duration(np.array([1.0])) == pytest.approx(1.0)
+
+
+@pytest.mark.parametrize(
+    ("change", "error"),
+    [
+        ({"n_rbf": 0}, ValueError),
+        ({"n_rbf": 2.0}, TypeError),
+        ({"n_rbf": True}, TypeError),
+        ({"d_max": 0.0}, ValueError),
+        ({"d_max": -1.0}, ValueError),
+        ({"d_max": math.inf}, ValueError),
+        ({"d_min": 2.0}, ValueError),
+        ({"d_min": 0.0}, ValueError),
+        ({"dt": 0.0}, ValueError),
+        ({"dt": math.nan}, ValueError),
+        ({"discount_rate": -0.1}, ValueError),
+        ({"discount_rate": math.nan}, ValueError),
+    ],
+)
+def test_settings_out_of_range(change, error):
+    good = {"n_rbf": 3, "d_max": 1.0, "d_min": 0.1, "dt": 0.1, "discount_rate": 0.4}
+    OptionSettings(**good)
+    with pytest.raises(error, match=next(iter(change))):
+        OptionSettings(**{**good, **change})
