@@ -102,7 +102,7 @@ class DACPolicy(BasePolicy):
     :param normalize_images: whether to divide images by 255
     :param optimizer_class: the optimizer to use
     :param optimizer_kwargs: its keyword arguments, without the learning rate; Adam runs fused with ``eps=1e-5`` by default
-    :raises ValueError: if there is less than one option, the actions' bounds are not finite, or gSDE is asked for
+    :raises ValueError: if there is less than one option, or gSDE is asked for
     """
 
     action_space: spaces.Box
@@ -127,11 +127,6 @@ class DACPolicy(BasePolicy):
             raise ValueError("DACPPO does not support generalized State-Dependent Exploration: remove use_sde=True")
         if n_options < 1:
             raise ValueError(f"n_options must be at least 1, not {n_options}")
-        if not (np.isfinite(action_space.low).all() and np.isfinite(action_space.high).all()):
-            raise ValueError(
-                f"DACPPO needs finite action bounds, not {action_space}, because its mean actions are squashed into them: "
-                "wrap the environment with gymnasium.wrappers.ClipAction or RescaleAction, or give its space bounds"
-            )
         if optimizer_class is th.optim.Adam:
             optimizer_kwargs = {"eps": 1e-5, "fused": True, **(optimizer_kwargs or {})}
         super().__init__(
