@@ -84,8 +84,8 @@ class SoftOptionActorCritic(OptionOffPolicyAlgorithm):
     def _setup_model(self) -> None:
         super()._setup_model()
         self._create_aliases()
-        self._source_parameters: list[nn.Parameter] = []
-        self._target_parameters: list[nn.Parameter] = []
+        self._source_parameters: list[th.Tensor] = []
+        self._target_parameters: list[th.Tensor] = []
         # Running statistics of batch normalisation are no parameters, so they are copied to the targets.
         self._batch_norm_stats: list[th.Tensor] = []
         self._batch_norm_stats_target: list[th.Tensor] = []

@@ -41,6 +41,8 @@ class OptionActor(SquashedActor):
     ``[omega_dim + 1]``.
     """
 
+    squash_scale: th.Tensor
+
     def __init__(self, observation_space: spaces.Space, action_space: spaces.Box, *args: Any, **kwargs: Any):
         super().__init__(observation_space, action_space, *args, **kwargs)
         self.omega_dim = action_space.shape[0] - 1
@@ -100,11 +102,11 @@ class CTCOPolicy(SoftOptionPolicy):
         # A parameter group of its own lets d's head have its own step size.
         head = set(self.actor.duration_head.parameters())
         self.actor.optimizer = self.optimizer_class(
-            [  # type: ignore[arg-type]
+            [
                 {"params": [p for p in self.actor.parameters() if p not in head]},
                 {"params": list(self.actor.duration_head.parameters())},
             ],
-            lr=lr_schedule(1),
+            lr=lr_schedule(1),  # type: ignore[call-arg]
             **self.optimizer_kwargs,
         )
         self.actor_target = self.make_actor()

@@ -249,7 +249,8 @@ class DACPPO(OnPolicyAlgorithm):
 
         :return: False if the callback stopped the rollout
         """
-        assert self._last_obs is not None and self._last_episode_starts is not None
+        obs = self._last_obs
+        assert obs is not None and self._last_episode_starts is not None
         assert isinstance(rollout_buffer, DACRolloutBuffer | DACDictRolloutBuffer)
         self.policy.set_training_mode(False)
         rollout_buffer.reset()
@@ -259,7 +260,7 @@ class DACPPO(OnPolicyAlgorithm):
             previous_options, episode_starts = self._last_options, self._last_episode_starts.astype(bool)
             with th.no_grad():
                 output = self.policy(
-                    obs_as_tensor(self._last_obs, self.device),
+                    obs_as_tensor(obs, self.device),
                     th.as_tensor(previous_options, device=self.device),
                     th.as_tensor(episode_starts, device=self.device),
                 )
@@ -278,12 +279,12 @@ class DACPPO(OnPolicyAlgorithm):
                     value = self._high_values(infos[i]["terminal_observation"], options[i : i + 1])
                     rewards[i] += self.step_gamma * value.item()
 
-            rollout_buffer.add_step(self._last_obs, rewards, episode_starts, previous_options, output)
-            self._last_obs = new_obs  # type: ignore[assignment]
+            rollout_buffer.add_step(obs, rewards, episode_starts, previous_options, output)
+            self._last_obs = obs = new_obs  # type: ignore[assignment]
             self._last_episode_starts = dones
             self._last_options = options
 
-        last_values = self._high_values(self._last_obs, self._last_options)
+        last_values = self._high_values(obs, self._last_options)
         rollout_buffer.compute_returns_and_advantage(last_values, dones)
         callback.update_locals(locals())
         callback.on_rollout_end()

@@ -116,12 +116,12 @@ class FiGARCritic(EnsembleCritic):
         self,
         observation_space: spaces.Space,
         action_space: spaces.Box,
-        *args: Any,
+        *,
         n_repetitions: int,
         **kwargs: Any,
     ):
         action_dim = action_space.shape[0] - 1
-        super().__init__(observation_space, action_space, *args, option_dim=action_dim, n_outputs=n_repetitions, **kwargs)
+        super().__init__(observation_space, action_space, option_dim=action_dim, n_outputs=n_repetitions, **kwargs)
 
 
 class FiGARSACPolicy(SoftOptionPolicy):
