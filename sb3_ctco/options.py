@@ -19,7 +19,7 @@ R              ``integrated_reward``                        reward rate × s
 import math
 from dataclasses import dataclass
 from functools import lru_cache
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 import numpy.typing as npt
@@ -67,7 +67,7 @@ def steps_in(duration: float, dt: float) -> int:
 
 
 def basis(phase: FloatArray, n_rbf: int) -> FloatArray:
-    """Normalised radial basis functions φ(t/d), equation (5) of the paper.
+    """Normalised radial basis functions φ(t/d), equation (4) of the paper.
 
     Centres stand at ``linspace(−0.5/n, 1 + 0.5/n, n)`` (0.5 for n = 1) with the variance ½((1 + 1/n)/n)². Each row
     sums to one, so φᵀω stays inside any box that ω is in, and ``n_rbf=1`` repeats one action.
@@ -76,11 +76,15 @@ def basis(phase: FloatArray, n_rbf: int) -> FloatArray:
     :param n_rbf: number of basis functions
     :return: shape ``[n_steps, n_rbf]``
     """
-    n = n_rbf
-    centres = np.linspace(-0.5 / n, 1 + 0.5 / n, n) if n > 1 else np.array([0.5])
-    variance = 0.5 * ((1 + 1 / n) / n) ** 2
+    centres, variance = _centres_and_variance(n_rbf)
     activation = np.exp(-((np.asarray(phase)[:, None] - centres) ** 2) / (2 * variance))
     return activation / activation.sum(axis=1, keepdims=True)
+
+
+@lru_cache(maxsize=64)
+def _centres_and_variance(n: int) -> tuple[FloatArray, float]:
+    centres = np.linspace(-0.5 / n, 1 + 0.5 / n, n) if n > 1 else np.array([0.5])
+    return centres, 0.5 * ((1 + 1 / n) / n) ** 2
 
 
 @lru_cache(maxsize=4096)
@@ -95,7 +99,7 @@ def basis_of_steps(n_steps: int, n_rbf: int) -> FloatArray:
 
 
 def action_plan(omega: FloatArray, n_steps: int) -> FloatArray:
-    """The whole open-loop action trajectory a_t = φ(t/d)ᵀω of an option, equation (5) of the paper.
+    """The whole open-loop action trajectory a_t = φ(t/d)ᵀω of an option, equation (4) of the paper.
 
     :param omega: weights, shape ``[action_dim, n_rbf]``
     :param n_steps: number of primitive steps of the option
@@ -103,6 +107,20 @@ def action_plan(omega: FloatArray, n_steps: int) -> FloatArray:
     """
     omega = np.asarray(omega)
     return basis_of_steps(n_steps, omega.shape[1]) @ omega.T
+
+
+def primitive_actions(trajectory: FloatArray, low: npt.NDArray[Any], high: npt.NDArray[Any]) -> npt.NDArray[Any]:
+    """Normalised actions in the units of an action box.
+
+    :param trajectory: actions in [−1, 1], shape ``[n_steps, action_dim]``
+    :param low: lower bounds of the box, shape ``action_shape``, of which action_dim is the product
+    :param high: upper bounds, likewise
+    :return: shape ``[n_steps, *action_shape]``, in the precision of ``low``
+    """
+    bottom = low.astype(np.float64).ravel()
+    actions = bottom + (0.5 * (trajectory + 1.0)) * (high.astype(np.float64).ravel() - bottom)
+    # The cast to the box's precision may round past a bound.
+    return actions.astype(low.dtype).reshape(-1, *low.shape).clip(low, high)
 
 
 def step_weight(dt: float, discount_rate: float) -> float:
@@ -114,7 +132,7 @@ def step_weight(dt: float, discount_rate: float) -> float:
 
 
 def integrated_reward(rewards: FloatArray, dt: float, discount_rate: float, unit: RewardUnit = "rate") -> float:
-    """R(s, ω, d) = ∫₀ᵈ e^(−τκ) r dκ, equation (6) of the paper, for rewards sampled once a step.
+    """R(s, ω, d) = ∫₀ᵈ e^(−τκ) r dκ, equation (5) of the paper, for rewards sampled once a step.
 
     A reward ``"rate"`` is held over its step, which makes the sum the exact integral of a piecewise constant rate.
     An ``"impulse"`` is paid at once, at the start of its step: Σ e^(−τk·dt)·r_k.

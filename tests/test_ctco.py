@@ -95,9 +95,7 @@ def test_densities_against_a_change_of_variables():
 
 def test_entropy_references():
     # Uniform over [−1, 1]^6 and over [−1, 1]
-    th.testing.assert_close(
-        log_reference_density(6, 0.1, 1.0, "uniform"), th.tensor([-6 * math.log(2.0), -math.log(2.0)])
-    )
+    th.testing.assert_close(log_reference_density(6, 0.1, 1.0, "uniform"), th.tensor([-6 * math.log(2.0), -math.log(2.0)]))
     # The unit density over ω and over d in s: [0.1, 2.1] s is as long as [−1, 1].
     th.testing.assert_close(log_reference_density(6, 0.1, 2.1, "paper"), th.zeros(2))
     th.testing.assert_close(log_reference_density(6, 0.1, 0.6, "paper"), th.tensor([0.0, math.log(0.25)]))
@@ -427,7 +425,7 @@ def test_a_bad_environment_leaves_no_trace_in_the_buffer(scripted_env, bad):
 
     env = Env(truncate_at=20)
     model = make(env, d_max=0.5, learning_starts=1000)
-    with pytest.raises((RuntimeError, ValueError), match="the motor is hot|not finite"):
+    with pytest.raises((RuntimeError, ValueError), match=r"the motor is hot|not finite"):
         model.learn(100)
     buffer = model.replay_buffer
     stored = buffer.pos
@@ -477,7 +475,7 @@ def test_save_and_load(tmp_path, random_walk_env):
             alone.set_env(OptionExecutionWrapper(random_walk_env(), **other))
     faster = random_walk_env()
     faster.dt = 0.05
-    with pytest.raises(ValueError, match="options have dt=0.05"):
+    with pytest.raises(ValueError, match=r"options have dt=0\.05"):
         CTCO.load(tmp_path / "model", env=faster)
     # On purpose, the same policy runs at another rate.
     assert CTCO.load(tmp_path / "model", env=faster, dt=0.05).learn(30).num_timesteps >= 30

@@ -106,6 +106,16 @@ def test_fast_rewards_agree_where_they_pay():
         assert env._reward() == env._task.get_reward(env._physics)
         paid += env._reward()
     assert 10 < paid < 290
+    env = make("point_mass", "easy").unwrapped
+    env.reset(seed=0)
+    values = set()
+    for _ in range(100):
+        with env._physics.reset_context():
+            env._data.qpos[:] = env._data.geom("target").xpos[:2] + rng.uniform(-0.04, 0.04, 2)
+        env._data.ctrl[:] = rng.uniform(-1.2, 1.2, 2)
+        assert env._reward() == pytest.approx(env._task.get_reward(env._physics), abs=1e-12)
+        values.add(round(env._reward(), 1))
+    assert len(values) > 5
     env = make("cheetah", "run").unwrapped
     env.reset(seed=0)
     values = set()

@@ -242,7 +242,7 @@ def test_one_repetition_is_sac(monkeypatch):
     monkeypatch.setattr(soft_actor_critic, "critic_loss", our_loss)
     monkeypatch.setattr(sac_module, "F", SimpleNamespace(mse_loss=their_loss))
     for algorithm in (model, sac):
-        np.random.seed(0)  # noqa: NPY002, the generator that the replay buffers draw from
+        np.random.seed(0)
         th.manual_seed(0)
         algorithm.train(1, batch_size=64)
     assert targets["ours"][0].std() > 0.01

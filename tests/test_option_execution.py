@@ -296,7 +296,7 @@ def test_evaluate_policy_reports_primitive_steps():
 
 def test_a_video_keeps_every_primitive_frame(tmp_path, scripted_env):
     class Rendered(scripted_env):
-        metadata = {"render_modes": ["rgb_array"], "render_fps": 10}  # noqa: RUF012
+        metadata = {"render_modes": ["rgb_array"], "render_fps": 10}
         render_mode = "rgb_array"
 
         def render(self):

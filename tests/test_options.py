@@ -1,3 +1,4 @@
+import itertools
 import math
 
 import numpy as np
@@ -111,7 +112,7 @@ def test_an_exponential_rate_converges_to_its_closed_form(a):
         errors.append(abs(integrated_reward(np.exp(a * t), 1 / n, tau) - exact))
     assert errors[-1] < 2e-3
     # First order: halving dt halves the error.
-    for coarse, fine in zip(errors, errors[1:], strict=False):
+    for coarse, fine in itertools.pairwise(errors):
         assert fine == pytest.approx(coarse / 2, rel=0.05)
 
 

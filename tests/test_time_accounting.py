@@ -95,9 +95,7 @@ def test_evaluations_and_checkpoints_fall_where_sacs_do(tmp_path, random_walk_en
         eval_env = random_walk_env()
     evaluation = EvalCallback(eval_env, n_eval_episodes=1, eval_freq=40, log_path=str(tmp_path), verbose=0, warn=False)
     model.learn(125, [checkpoint, evaluation, every])
-    assert sorted(path.name for path in tmp_path.glob("*.zip")) == sorted(
-        f"rl_model_{n}_steps.zip" for n in (30, 60, 90, 120)
-    )
+    assert sorted(path.name for path in tmp_path.glob("*.zip")) == sorted(f"rl_model_{n}_steps.zip" for n in (30, 60, 90, 120))
     evaluations = np.load(tmp_path / "evaluations.npz")
     np.testing.assert_array_equal(evaluations["timesteps"], [40, 80, 120])
     assert (evaluations["ep_lengths"] == 20).all()

@@ -21,6 +21,7 @@ from sb3_ctco.options import (
     action_plan,
     discount,
     integrated_reward,
+    primitive_actions,
 )
 
 SequenceResult = tuple[Any, npt.ArrayLike, bool, bool, dict[str, Any]]
@@ -36,7 +37,9 @@ class SupportsStepSequence(Protocol):
     last step terminated or truncated the episode, and the last step's info.
     """
 
-    def step_sequence(self, actions: np.ndarray) -> SequenceResult: ...
+    def step_sequence(self, actions: np.ndarray) -> SequenceResult:
+        """Play actions ``[n_steps, *action_shape]``."""
+        ...
 
 
 def find_dt(env: gym.Env) -> float | None:
@@ -65,7 +68,7 @@ class OptionExecutionWrapper(gym.Wrapper, RecordConstructorArgs):
     whole number of primitive steps (half up, at least one), computes all actions in one go, plays them, stops early
     at the end of the episode, and returns the last observation and info. Entries outside [−1, 1] are clipped.
 
-    ``info["option"]`` tells what ran: ``duration`` (s), ``n_steps``, ``integrated_reward`` (R, equation (6) of
+    ``info["option"]`` tells what ran: ``duration`` (s), ``n_steps``, ``integrated_reward`` (R, equation (5) of
     Karimi et al. 2023) and ``discount`` (e^(−τ·duration)).
 
     The order of wrappers is ``OptionExecutionWrapper(Monitor(TimeLimit(env)))``: what is inside sees primitive steps.
@@ -96,7 +99,7 @@ class OptionExecutionWrapper(gym.Wrapper, RecordConstructorArgs):
     :raises ValueError: if its bounds are not finite, a setting is out of range, or dt is not given and not found
     """
 
-    action_space: spaces.Box  # type: ignore[assignment]
+    action_space: spaces.Box  # type: ignore[assignment, override]
 
     def __init__(
         self,
@@ -124,7 +127,7 @@ class OptionExecutionWrapper(gym.Wrapper, RecordConstructorArgs):
         space = env.action_space
         if not isinstance(space, spaces.Box):
             raise TypeError(
-                f"OptionExecutionWrapper needs a Box action space, not {space}: an option is a trajectory of continuous actions"
+                f"OptionExecutionWrapper needs a Box action space, not {space}: options are trajectories of continuous actions"
             )
         if not (np.isfinite(space.low).all() and np.isfinite(space.high).all()):
             raise ValueError(
@@ -149,10 +152,9 @@ class OptionExecutionWrapper(gym.Wrapper, RecordConstructorArgs):
         self.reward: Literal["sum", "integral"] = reward
         self.reward_unit: RewardUnit = reward_unit
 
-        self._inner_space = space
-        self._low = space.low.astype(np.float64).ravel()
-        self._range = space.high.astype(np.float64).ravel() - self._low
-        option_dim = self._low.size * n_rbf + 1
+        #: The action space of the environment inside.
+        self.primitive_action_space = space
+        option_dim = space.low.size * n_rbf + 1
         self.action_space = spaces.Box(-1.0, 1.0, (option_dim,), np.float32)
         self._checks_observation = isinstance(env.observation_space, spaces.Box) and np.issubdtype(
             env.observation_space.dtype, np.floating
@@ -180,7 +182,7 @@ class OptionExecutionWrapper(gym.Wrapper, RecordConstructorArgs):
         if not np.isfinite(option).all():
             raise ValueError(f"an option must be finite, not {option}")
         if self._play is None:
-            raise ResetNeeded("call reset() first: the environment was not reset, its episode has ended, or it raised an error")
+            raise ResetNeeded("call reset() first: the environment was not reset, its episode ended, or it raised an error")
         play, self._play = self._play, None
 
         obs, rewards, terminated, truncated, info = play(self.plan(option))
@@ -211,18 +213,16 @@ class OptionExecutionWrapper(gym.Wrapper, RecordConstructorArgs):
         :return: shape ``[n_steps, *action_shape]``
         """
         omega, n_steps = self.option_settings.decode(np.clip(option, -1.0, 1.0))
-        actions = self._low + (0.5 * (action_plan(omega, n_steps) + 1.0)) * self._range
-        space = self._inner_space
-        actions = actions.astype(space.dtype).reshape(n_steps, *space.shape)
-        # The cast to the space's precision may round past a bound.
-        return np.clip(actions, space.low, space.high)
+        return primitive_actions(
+            action_plan(omega, n_steps), self.primitive_action_space.low, self.primitive_action_space.high
+        )
 
     def _step_in_a_loop(self, actions: np.ndarray) -> SequenceResult:
-        rewards = []
+        rewards: list[float] = []
         step = self.env.step
         for action in actions:
             obs, reward, terminated, truncated, info = step(action)
-            rewards.append(reward)
+            rewards.append(reward)  # type: ignore[arg-type]
             if terminated or truncated:
                 break
         return obs, rewards, terminated, truncated, info

@@ -61,7 +61,8 @@ class _OptionStorage(ReplayBuffer):
             options = [info["option"] for info in infos]
         except KeyError:
             raise ValueError(
-                f"{type(self).__name__} needs info['option']: wrap the environment with sb3_ctco.wrappers.OptionExecutionWrapper"
+                f"{type(self).__name__} needs info['option']: wrap the environment with "
+                "sb3_ctco.wrappers.OptionExecutionWrapper"
             ) from None
         durations = np.array([option["duration"] for option in options])
         integrated_rewards = np.array([option["integrated_reward"] for option in options])

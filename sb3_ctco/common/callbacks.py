@@ -26,6 +26,7 @@ class PrimitiveStepCallback(BaseCallback):
         self.callback = callback
 
     def init_callback(self, model: BaseAlgorithm) -> None:
+        """Initialise the child, too."""
         super().init_callback(model)
         if self.callback is not None:
             self.callback.init_callback(model)
@@ -40,6 +41,10 @@ class PrimitiveStepCallback(BaseCallback):
             self.callback.on_rollout_start()
 
     def on_step(self) -> bool:
+        """One decision: tick the child, and count primitive steps.
+
+        :return: False if the child wants training to stop
+        """
         n_envs = self.training_env.num_envs
         # collect_rollouts has counted this decision as one step of each environment.
         before = self.model.num_timesteps - n_envs

@@ -1,10 +1,13 @@
-"""Measure agents that decide at different rates by one yardstick: the discounted return in task time."""
+"""Measure agents that decide at different rates by one yardstick: returns in task time, and smoothness of actions."""
 
+import math
 from dataclasses import dataclass, field
 from typing import Any
 
 import gymnasium as gym
 import numpy as np
+import numpy.typing as npt
+from gymnasium import spaces
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.type_aliases import PolicyPredictor
 from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv
@@ -12,18 +15,62 @@ from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv
 from sb3_ctco.options import DEFAULT_DISCOUNT_RATE, discount, step_weight
 
 
+def mean_absolute_jerk(actions: npt.ArrayLike, dt: float) -> float:
+    """Mean absolute third derivative of an action signal, by finite differences: the mean size of Δ³a/dt³.
+
+    The measure of Hogan and Sternad 2009, "Sensitivity of Smoothness Measures to Movement Duration, Amplitude, and
+    Arrests", https://doi.org/10.3200/35-09-004-RC, of the action in place of a position. A signal with jumps has a jerk
+    that grows as dt shrinks: compare at one dt.
+
+    :param actions: one action a step, normalised to [−1, 1], shape ``[n_steps, action_dim]``
+    :param dt: the interaction period, in s
+    :return: in 1/s³, averaged over steps and dimensions; nan for less than four steps
+    """
+    actions = np.asarray(actions, dtype=np.float64)
+    return float(np.abs(np.diff(actions, n=3, axis=0)).mean()) / dt**3 if len(actions) > 3 else math.nan
+
+
+def spectral_smoothness(actions: npt.ArrayLike) -> float:
+    """Sm = 2/(n·f_s)·Σᵢ Mᵢfᵢ, the measure of the CAPS paper; smaller is smoother.
+
+    Mysore, Mabsout, Mancuso, Saenko 2021, "Regularizing Action Policies for Smooth Control with Reinforcement Learning",
+    section "Measuring Smoothness", https://arxiv.org/abs/2012.06644. Mᵢ is the amplitude of the sinusoid of frequency fᵢ
+    in the signal, i = 1 … n = n_steps // 2 (the mean has frequency 0), and f_s the sampling frequency. Frequencies are
+    relative to f_s, so compare at one dt.
+
+    :param actions: one action a step, normalised to [−1, 1], shape ``[n_steps, action_dim]``
+    :return: averaged over dimensions, at least 0; nan for less than two steps
+    """
+    actions = np.asarray(actions, dtype=np.float64)
+    n_steps = len(actions)
+    n = n_steps // 2
+    if n == 0:
+        return math.nan
+    amplitudes = 2.0 * np.abs(np.fft.rfft(actions, axis=0)[1 : n + 1]) / n_steps
+    if n_steps % 2 == 0:
+        amplitudes[-1] /= 2.0  # half the sampling frequency has no mirror image
+    relative_frequencies = np.fft.rfftfreq(n_steps)[1 : n + 1, None]
+    return float(2.0 / n * (amplitudes * relative_frequencies).sum(axis=0).mean())
+
+
 @dataclass
 class EpisodeStatistics:
     """What an episode was worth, and how it was played.
 
-    :param discounted_return: ∫ e^(−τt) r dt, equation (3) of Karimi et al. 2023, in reward rate × s
+    :param discounted_return: ∫ e^(−τt) r dt, equation (2) of Karimi et al. 2023, in reward rate × s
     :param seconds: task time of the episode, in s
     :param decisions: how often the policy was asked
+    :param episode_return: sum of the rewards that ``step`` returned
+    :param mean_absolute_jerk: of the primitive actions, see :func:`mean_absolute_jerk`; nan if not measured
+    :param spectral_smoothness: likewise, see :func:`spectral_smoothness`
     """
 
     discounted_return: float = 0.0
     seconds: float = 0.0
     decisions: int = 0
+    episode_return: float = 0.0
+    mean_absolute_jerk: float = math.nan
+    spectral_smoothness: float = math.nan
 
     @property
     def decision_rate_hz(self) -> float:
@@ -60,9 +107,44 @@ class _EpisodeTracker:
             episode.discounted_return += float(discount(episode.seconds, self.discount_rate)) * integral
             episode.seconds += duration
             episode.decisions += 1
+            episode.episode_return += float(reward)
             if done:
                 ended.append(episode)
                 self.running[i] = EpisodeStatistics()
+        return ended
+
+
+@dataclass
+class _ActionRecorder:
+    """Collects the primitive actions of a VecEnv's episodes, whether its steps are options or primitive steps."""
+
+    env: VecEnv
+    actions: list[list[np.ndarray]] = field(init=False)
+
+    def __post_init__(self) -> None:
+        self.actions = [[] for _ in range(self.env.num_envs)]
+        self.is_option_env = self.env.has_attr("option_settings")
+        space = self.env.get_attr("primitive_action_space")[0] if self.is_option_env else self.env.action_space
+        if not (isinstance(space, spaces.Box) and np.isfinite(space.low).all() and np.isfinite(space.high).all()):
+            raise ValueError(f"smoothness is measured of actions in a Box with finite bounds, not in {space}")
+        self.low, self.range = space.low.astype(np.float64), space.high.astype(np.float64) - space.low
+
+    def step(self, actions: np.ndarray, dones: np.ndarray, infos: list[dict[str, Any]]) -> list[np.ndarray]:
+        """Account for one step of each environment.
+
+        :return: the normalised actions of the episodes that ended with it, each ``[n_steps, action_dim]``
+        """
+        ended = []
+        for i, (action, done, info) in enumerate(zip(actions, dones, infos, strict=True)):
+            if self.is_option_env:
+                played = self.env.env_method("plan", action, indices=i)[0][: info["option"]["n_steps"]]
+            else:
+                played = action[None]
+            self.actions[i].append(2.0 * (played - self.low) / self.range - 1.0)
+            if done:
+                episode = np.concatenate(self.actions[i])
+                ended.append(episode.reshape(len(episode), -1))
+                self.actions[i] = []
         return ended
 
 
@@ -73,6 +155,7 @@ def evaluate_discounted_return(
     deterministic: bool = True,
     discount_rate: float = DEFAULT_DISCOUNT_RATE,
     dt: float | None = None,
+    smoothness: bool = False,
 ) -> list[EpisodeStatistics]:
     """Play whole episodes.
 
@@ -83,18 +166,26 @@ def evaluate_discounted_return(
     :param deterministic: whether to act greedily
     :param discount_rate: τ, in 1/s
     :param dt: interaction period in s, needed where steps are no options
+    :param smoothness: whether to measure the smoothness of the primitive actions as well, normalised to [−1, 1]
     :return: one entry an episode
+    :raises ValueError: if smoothness is asked for where actions are not in a Box with finite bounds
     """
     if not isinstance(env, VecEnv):
         single = env
         env = DummyVecEnv([lambda: single])
     tracker = _EpisodeTracker(env.num_envs, discount_rate, dt)
+    recorder = _ActionRecorder(env) if smoothness else None
     episodes: list[EpisodeStatistics] = []
     obs = env.reset()
     while len(episodes) < n_eval_episodes:
         actions, _ = model.predict(obs, deterministic=deterministic)  # type: ignore[arg-type]
         obs, rewards, dones, infos = env.step(actions)
-        episodes += tracker.step(rewards, dones, infos)
+        ended = tracker.step(rewards, dones, infos)
+        if recorder is not None:
+            for episode, played in zip(ended, recorder.step(actions, dones, infos), strict=True):
+                episode.mean_absolute_jerk = mean_absolute_jerk(played, episode.seconds / len(played))
+                episode.spectral_smoothness = spectral_smoothness(played)
+        episodes += ended
     return episodes[:n_eval_episodes]
 
 

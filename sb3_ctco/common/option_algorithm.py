@@ -93,6 +93,8 @@ class OptionOffPolicyAlgorithm(OffPolicyAlgorithm):
             if not updates_per_second > 0:
                 raise ValueError(f"updates_per_second must be positive or None, not {updates_per_second}")
         self.updates_per_second = updates_per_second
+        #: The action space of the bare environment; None until there is an environment.
+        self.primitive_action_space: spaces.Box | None = None
         self._updates_due = 0.0
         self._durations_since_log: list[float] = []
 
@@ -109,6 +111,21 @@ class OptionOffPolicyAlgorithm(OffPolicyAlgorithm):
             supported_action_spaces=(spaces.Box,),
             support_multi_env=True,
             **kwargs,
+        )
+
+    @property
+    def option_settings(self) -> OptionSettings:
+        """What the policy's option vectors mean.
+
+        :raises ValueError: before ``dt`` and ``d_min`` are known, that is without an environment
+        """
+        if self.dt is None or self.d_min is None:
+            raise ValueError(
+                f"dt={self.dt} s and d_min={self.d_min} s are found in an environment, and {type(self).__name__} has not "
+                "had one: pass it env, or dt and d_min"
+            )
+        return OptionSettings(
+            n_rbf=self.n_rbf, d_max=self.d_max, d_min=self.d_min, dt=self.dt, discount_rate=self.discount_rate
         )
 
     def wrap_env(self, env: gym.Env) -> OptionExecutionWrapper:
@@ -161,6 +178,14 @@ class OptionOffPolicyAlgorithm(OffPolicyAlgorithm):
                         f"the environment's options have {name}={getattr(one, name)}, {type(self).__name__} has "
                         f"{name}={value}: give both the same (discount_rate is -ln(gamma)/gamma_dt)"
                     )
+        action_spaces: list[spaces.Box] = env.get_attr("primitive_action_space")
+        for space in action_spaces:
+            if space != (self.primitive_action_space or action_spaces[0]):
+                raise ValueError(
+                    f"the environment's actions are in {space}, {type(self).__name__} learned actions in "
+                    f"{self.primitive_action_space or action_spaces[0]}: options mean the same in both only if these agree"
+                )
+        self.primitive_action_space = action_spaces[0]
         return settings[0]
 
     def set_env(self, env: GymEnv, force_reset: bool = True) -> None:
@@ -279,11 +304,14 @@ class OptionOffPolicyAlgorithm(OffPolicyAlgorithm):
         self._durations_since_log.extend(info["option"]["duration"] for info in infos)
 
     def dump_logs(self) -> None:
-        """Write log data; also the mean duration and the decision rate since the last time."""
+        """Write log data; also the durations of options, their mean and the decision rate since the last time."""
         if self._durations_since_log:
             duration = float(np.mean(self._durations_since_log))
             self.logger.record("option/duration_mean", duration)
             self.logger.record("option/decision_rate_hz", 1.0 / duration)
+            # TensorBoard shows a tensor as a histogram; other formats cannot.
+            durations = th.tensor(self._durations_since_log)
+            self.logger.record("option/duration", durations, exclude=("stdout", "log", "json", "csv"))
             self._durations_since_log.clear()
         super().dump_logs()
 

@@ -187,11 +187,11 @@ class SoftOptionPolicy(sac_policies.SACPolicy):
         self.critic_target.requires_grad_(False)
 
     def make_actor(self, features_extractor: BaseFeaturesExtractor | None = None) -> Any:
-        """An ``actor_class`` with the policy's settings."""
+        """An actor; with a features extractor of its own unless one is given."""
         kwargs = self._update_features_extractor(self.net_args, features_extractor)
         return self.actor_class(**kwargs).to(self.device)
 
     def make_critic(self, features_extractor: BaseFeaturesExtractor | None = None) -> Any:
-        """A ``critic_class`` with the policy's settings."""
+        """An ensemble of critics; with a features extractor of its own unless one is given."""
         kwargs = self._update_features_extractor(self.critic_kwargs, features_extractor)
         return self.critic_class(**kwargs).to(self.device)

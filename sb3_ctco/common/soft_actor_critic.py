@@ -20,7 +20,7 @@ def critic_target(
     next_entropy_costs: th.Tensor,
     high_freq_penalty: float = 0.0,
 ) -> th.Tensor:
-    """R − β_h + γ(d)·(Q̂_χ'(s', ω', d') − β_E log π(ω', d'|s')), the target in CTCO's L_Q (after equation (7)).
+    """``R − β_h + γ(d)·(Q̂_χ'(s', ω', d') − β_E log π(ω', d'|s'))``, the target in CTCO's L_Q (after equation (6)).
 
     All tensors are ``[batch, 1]``.
 

@@ -22,7 +22,7 @@ EntropyReference = Literal["uniform", "paper"]
 
 
 def actor_loss(q_values: th.Tensor, entropy_costs: th.Tensor) -> th.Tensor:
-    """L_π, equation (9) of the paper: its gradient runs through ω and d of reparameterised options.
+    """L_π, equation (8) of the paper: its gradient runs through ω and d of reparameterised options.
 
     :param q_values: ``[n_critics, batch, 1]``, of options that the policy sampled
     :param entropy_costs: β_E log π of those options, ``[batch, 1]``

@@ -77,7 +77,7 @@ class OptionActor(SquashedActor):
         return y.tanh(), th.stack((omega_log_prob, log_prob[:, -1]), dim=1)
 
     def forward(self, obs: PyTorchObs, deterministic: bool = False) -> th.Tensor:
-        """Options ``[batch, omega_dim + 1]`` in [−1, 1]; greedy ones if ``deterministic``."""
+        """Options ``[batch, omega_dim + 1]`` in [−1, 1]: sampled, or those of the means."""
         mean, log_std = self.distribution_parameters(obs)
         x = mean if deterministic else mean + th.randn_like(mean) * log_std.exp()
         return th.tanh(x * self.squash_scale)

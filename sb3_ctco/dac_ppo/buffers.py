@@ -121,7 +121,7 @@ class _DACStorage(RolloutBuffer):
             )
         ]
         while True:
-            order = np.random.permutation(len(actions))  # noqa: NPY002, the generator that Stable-Baselines3 seeds
+            order = np.random.permutation(len(actions))
             for start in range(0, len(order), batch_size):
                 rows = order[start : start + batch_size]
                 previous_options, episode_starts, options, log_probs, advantages, returns = (

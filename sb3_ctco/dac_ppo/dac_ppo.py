@@ -343,7 +343,7 @@ class DACPPO(OnPolicyAlgorithm):
         self._update_learning_rate(self.policy.optimizer)
         clip_range = self._clip_range_schedule(self._current_progress_remaining)
 
-        order = MDPS if np.random.rand() < 0.5 else MDPS[::-1]  # noqa: NPY002, the generator that SB3 seeds
+        order = MDPS if np.random.rand() < 0.5 else MDPS[::-1]
         for mdp, n_updates in zip(order, self._numbers_of_updates(), strict=True):
             batches = self.rollout_buffer.minibatches(mdp, self.batch_size)
             statistics = [self._update(mdp, batch, clip_range) for batch in itertools.islice(batches, n_updates)]

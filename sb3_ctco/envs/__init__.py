@@ -1,5 +1,7 @@
 """Environments of sb3-ctco, registered with Gymnasium when the package is imported."""
 
+from typing import Any
+
 import gymnasium as gym
 
 #: Domains and tasks of dm_control's suite, spelled out so that registering them does not import dm_control.
@@ -25,15 +27,29 @@ DM_CONTROL_TASKS: dict[str, tuple[str, ...]] = {
     "walker": ("stand", "walk", "run"),
 }
 
+#: Tasks of the paper's frequency study, in episodes of 10 s, and its interaction frequencies in Hz.
+STUDY_TASKS: dict[str, dict[str, Any]] = {
+    "point_mass-sparse": {"domain": "point_mass", "task": "easy", "sparse": True},
+    "cheetah-run": {"domain": "cheetah", "task": "run"},
+    "ball_in_cup-catch": {"domain": "ball_in_cup", "task": "catch"},
+}
+STUDY_RATES = (50, 100, 250, 500)
+
 
 def register_envs() -> None:
-    """Register ``sb3_ctco/<domain>-<task>-v0`` for every task of dm_control's suite; once is enough."""
-    for domain, tasks in DM_CONTROL_TASKS.items():
-        for task in tasks:
-            env_id = f"sb3_ctco/{domain}-{task}-v0"
-            if env_id not in gym.registry:
-                gym.register(
-                    env_id,
-                    entry_point="sb3_ctco.envs.dm_control:DMControlEnv",
-                    kwargs={"domain": domain, "task": task},
-                )
+    """Register dm_control's suite and the paper's settings with Gymnasium; once is enough.
+
+    ``sb3_ctco/<domain>-<task>-v0`` is each task of the suite, and ``sb3_ctco/<study task>-<rate>hz-v0`` each task of the
+    paper's study at each of its frequencies, for tools that know an environment by its id alone.
+    """
+    ids: dict[str, dict[str, Any]] = {
+        f"sb3_ctco/{domain}-{task}-v0": {"domain": domain, "task": task}
+        for domain, tasks in DM_CONTROL_TASKS.items()
+        for task in tasks
+    }
+    for name, kwargs in STUDY_TASKS.items():
+        for rate in STUDY_RATES:
+            ids[f"sb3_ctco/{name}-{rate}hz-v0"] = {**kwargs, "dt": 1.0 / rate, "time_limit": 10.0}
+    for env_id, kwargs in ids.items():
+        if env_id not in gym.registry:
+            gym.register(env_id, entry_point="sb3_ctco.envs.dm_control:DMControlEnv", kwargs=kwargs)

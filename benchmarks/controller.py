@@ -1,0 +1,52 @@
+"""Time one control tick of OptionController.
+
+    python benchmarks/controller.py
+
+Prints microseconds a tick, median and 99th percentile, between decisions and at decisions.
+"""
+
+import tempfile
+import time
+from pathlib import Path
+
+import gymnasium as gym
+import numpy as np
+import torch as th
+
+from sb3_ctco import CTCO, OptionController
+from sb3_ctco.export import export_onnx
+
+N_TICKS = 20_000
+
+
+def measure(name: str, controller: OptionController, observation: np.ndarray, clock: bool) -> None:
+    ticks: list[float] = []
+    decisions: list[float] = []
+    for i in range(N_TICKS):
+        now = i * controller.dt if clock else None
+        start = time.perf_counter()
+        controller(observation, now)
+        seconds = time.perf_counter() - start
+        (decisions if np.all(controller.elapsed == 0) else ticks).append(seconds)
+    for kind, seconds in (("between decisions", ticks), ("at a decision", decisions)):
+        median, high = np.percentile(seconds, [50, 99]) * 1e6
+        print(f"| {name} | {kind} | {median:.1f} | {high:.1f} |")
+
+
+def main() -> None:
+    th.set_num_threads(1)
+    env = gym.make("sb3_ctco/cheetah-run-v0", dt=0.002)
+    model = CTCO("MlpPolicy", env, n_rbf=3, d_max=0.5, seed=0)
+    obs, _ = env.reset(seed=0)
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "model.onnx"
+        export_onnx(model, path)
+        print("| policy and ticks | tick | median, µs | 99 %, µs |\n|---|---|---|---|")
+        for kind, policy in (("PyTorch", model), ("onnxruntime", path)):
+            measure(f"{kind}, every dt", OptionController(policy), obs, False)
+            measure(f"{kind}, by a clock", OptionController(policy), obs, True)
+            measure(f"{kind}, 8 robots, every dt", OptionController(policy), np.tile(obs, (8, 1)), False)
+
+
+if __name__ == "__main__":
+    main()

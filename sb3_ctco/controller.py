@@ -1,0 +1,359 @@
+"""Run a trained policy in a control loop: an observation in, an action of the bare environment or robot out."""
+
+import json
+import pickle
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Protocol
+
+import numpy as np
+import numpy.typing as npt
+from gymnasium import spaces
+
+from sb3_ctco.options import OptionSettings, action_plan, basis, primitive_actions
+
+if TYPE_CHECKING:
+    from stable_baselines3.common.vec_env import VecNormalize
+
+    from sb3_ctco.common.option_algorithm import OptionOffPolicyAlgorithm
+
+Observation = npt.NDArray[Any] | dict[str, npt.NDArray[Any]]
+
+#: Key under which an exported file keeps what its options mean.
+METADATA_KEY = "sb3_ctco"
+
+
+class OptionPolicy(Protocol):
+    """What :class:`OptionController` needs of a policy: a function from observations to options, and their meaning."""
+
+    option_settings: OptionSettings
+    primitive_action_space: spaces.Box
+
+    def __call__(self, observation: Observation) -> np.ndarray:
+        """Options for one observation, shape ``[option_dim]``, or for several, ``[n, option_dim]``."""
+
+
+class ModelPolicy:
+    """The policy of a trained model as an :class:`OptionPolicy`.
+
+    :param model: a trained model that decides by options, for instance CTCO
+    :param deterministic: whether to act greedily
+    :param vec_normalize: normalises observations as in training, if training did; by default the one around the
+        environment that the model has
+    :raises TypeError: if the model does not decide by options
+    :raises ValueError: if the model never had an environment
+    """
+
+    def __init__(
+        self,
+        model: "OptionOffPolicyAlgorithm",
+        deterministic: bool = True,
+        vec_normalize: "VecNormalize | None" = None,
+    ):
+        if not hasattr(model, "primitive_action_space"):
+            raise TypeError(
+                f"OptionController needs a model that decides by options, such as CTCO, not {type(model).__name__}: "
+                "a model of fixed rate has its action from model.predict"
+            )
+        if model.primitive_action_space is None:
+            raise ValueError(
+                f"this {type(model).__name__} never had an environment, so the bounds of its actions are not known: "
+                "call set_env(env) before, and save the model after that"
+            )
+        self.option_settings = model.option_settings
+        self.primitive_action_space = model.primitive_action_space
+        self.deterministic = deterministic
+        self.vec_normalize = model.get_vec_normalize_env() if vec_normalize is None else vec_normalize
+        self.model = model
+
+    def __call__(self, observation: Observation) -> np.ndarray:
+        """Options for one or several observations."""
+        if self.vec_normalize is not None:
+            observation = self.vec_normalize.normalize_obs(observation)
+        return self.model.predict(observation, deterministic=self.deterministic)[0]
+
+
+class OnnxPolicy:
+    """A greedy policy in an ONNX file written by :func:`sb3_ctco.export.export_onnx`, as an :class:`OptionPolicy`.
+
+    Needs onnxruntime, and neither PyTorch nor Stable-Baselines3. Observations are those of the environment: if training
+    normalised them, the file does as well. Images come channels first.
+
+    :param path: the file
+    :param n_threads: threads of onnxruntime; more than one seldom pays for networks of this size
+    :raises ImportError: without onnxruntime
+    :raises ValueError: if the file was not written by ``export_onnx``
+    """
+
+    def __init__(self, path: str | Path, n_threads: int = 1):
+        try:
+            import onnxruntime  # noqa: PLC0415
+        except ImportError as error:
+            raise ImportError("running an exported policy needs onnxruntime: pip install 'sb3-ctco[onnx]'") from error
+        options = onnxruntime.SessionOptions()
+        options.intra_op_num_threads = n_threads
+        self._session = onnxruntime.InferenceSession(str(path), options, providers=["CPUExecutionProvider"])
+        metadata = self._session.get_modelmeta().custom_metadata_map
+        if METADATA_KEY not in metadata:
+            raise ValueError(f"{path} does not tell what its options mean: write it with sb3_ctco.export.export_onnx")
+        self.option_settings, self.primitive_action_space, self._observations = _from_metadata(metadata[METADATA_KEY])
+
+    def __call__(self, observation: Observation) -> np.ndarray:
+        """Options for one or several observations.
+
+        :raises ValueError: if an observation has another shape than in training
+        """
+        leaves = observation if isinstance(observation, dict) else {"observation": observation}
+        several, feed = False, {}
+        for name, (shape, dtype) in self._observations.items():
+            leaf = np.asarray(leaves[name], dtype=dtype)
+            if leaf.shape[-len(shape) :] != shape or leaf.ndim not in (len(shape), len(shape) + 1):
+                raise ValueError(f"{name} must have shape {shape} or [n, {', '.join(map(str, shape))}], not {leaf.shape}")
+            several = leaf.ndim > len(shape)
+            feed[name] = leaf.reshape(-1, *shape)
+        options = self._session.run(None, feed)[0]
+        return options if several else options[0]
+
+
+def to_metadata(
+    settings: OptionSettings, action_space: spaces.Box, observations: dict[str, tuple[tuple[int, ...], str]]
+) -> str:
+    """What an exported policy's options mean, as a line of JSON.
+
+    :param observations: shape and dtype of each observation, by the name of the file's input
+    """
+    return json.dumps(
+        {
+            "option_settings": asdict(settings),
+            "action_low": action_space.low.tolist(),
+            "action_high": action_space.high.tolist(),
+            "action_dtype": str(action_space.dtype),
+            "observations": observations,
+        }
+    )
+
+
+def _from_metadata(text: str) -> tuple[OptionSettings, spaces.Box, dict[str, tuple[tuple[int, ...], str]]]:
+    data = json.loads(text)
+    dtype = np.dtype(data["action_dtype"])
+    box = spaces.Box(np.array(data["action_low"], dtype), np.array(data["action_high"], dtype), dtype=dtype.type)
+    observations = {name: (tuple(shape), kind) for name, (shape, kind) in data["observations"].items()}
+    return OptionSettings(**data["option_settings"]), box, observations
+
+
+@dataclass(slots=True)
+class _Execution:
+    """An option in execution, or none yet (``n_steps`` of 0).
+
+    :param plan: its actions, if ticks come at a fixed rate
+    :param tick: how many of its ticks have passed
+    :param start: when it began, by the caller's clock, in s
+    """
+
+    option: np.ndarray
+    omega: np.ndarray
+    n_steps: int
+    plan: np.ndarray
+    tick: int = 0
+    start: float = 0.0
+
+
+class OptionController:
+    """A trained policy as a controller: called once a control tick, it returns the action to apply until the next.
+
+    It holds the option that runs, ω and d, and asks the policy for the next one when that has run out. Between two
+    decisions a tick reads an action from memory; the observation is not looked at.
+
+    Ticks come either at a fixed rate, ``controller(obs)`` every ``dt`` seconds, where ``dt`` may be another than in
+    training; or whenever they come, ``controller(obs, now=t)`` with a clock of your own, in s. An option's duration is
+    rounded to whole ``dt`` in both cases, as in :class:`~sb3_ctco.wrappers.OptionExecutionWrapper`; with a clock the
+    option ends with the tick that is nearest to its end.
+
+    Several robots are driven at once by observations with a leading axis: each has an option of its own, and the
+    policy is asked about those whose option has run out.
+
+    Example:
+        >>> import gymnasium as gym
+        >>> from sb3_ctco import CTCO, OptionController
+        >>> env = gym.make("Pendulum-v1")
+        >>> controller = OptionController(CTCO("MlpPolicy", env))
+        >>> obs, _ = env.reset(seed=0)
+        >>> action = controller(obs)
+        >>> action.shape == env.action_space.shape
+        True
+
+    :param policy: a trained model; or the path of one: ``.zip`` as saved by CTCO, or ``.onnx`` as written by
+        :func:`sb3_ctco.export.export_onnx`; or an :class:`OptionPolicy`
+    :param dt: time between two ticks, in s; training's by default
+    :param deterministic: whether to act greedily; an exported policy always does
+    :param vec_normalize: normalises observations as in training, or the path it was saved to; needed for a path to a
+        ``.zip`` only, and only if training normalised observations
+    :raises ValueError: if ``dt`` is not a positive number, or the file is of another kind
+    :raises FileNotFoundError: if there is no such file
+    """
+
+    def __init__(
+        self,
+        policy: "OptionOffPolicyAlgorithm | OptionPolicy | str | Path",
+        dt: float | None = None,
+        deterministic: bool = True,
+        vec_normalize: "VecNormalize | str | Path | None" = None,
+    ):
+        self.policy = _as_policy(policy, deterministic, vec_normalize)
+        trained = self.policy.option_settings
+        #: What options mean here: training's settings, at this controller's ``dt``.
+        self.settings = trained if dt is None else replace(trained, dt=dt)
+        self._low = self.policy.primitive_action_space.low
+        self._high = self.policy.primitive_action_space.high
+        self._executions: list[_Execution] = []
+        self._several = False
+        self._now: float | None = None
+
+    @property
+    def dt(self) -> float:
+        """Time between two ticks, in s."""
+        return self.settings.dt
+
+    def reset(self, which: Sequence[int] | npt.NDArray[Any] | None = None) -> None:
+        """Forget the options that run, so that the next tick decides anew: at the start of each episode.
+
+        :param which: with several observations, those to reset: their indices or a mask; all of them by default
+        """
+        if which is None:
+            self._executions = []
+            self._now = None
+            return
+        indices = np.arange(len(self._executions))[np.asarray(which)]
+        for i in np.atleast_1d(indices):
+            self._executions[i].n_steps = 0
+
+    def __call__(self, observation: Observation, now: float | None = None) -> np.ndarray:
+        """The action to apply from this tick to the next.
+
+        :param observation: one observation, or several with a leading axis
+        :param now: the time of this tick by the caller's clock, in s; None if ticks come every ``dt``
+        :return: shape ``[*action_shape]``, or ``[n, *action_shape]`` for n observations
+        :raises ValueError: if ``now`` is not finite, runs backwards, or is given at some ticks and not at others; or if
+            the number of observations changes without a reset
+        """
+        executions = self._executions
+        if executions:
+            if (now is None) != (self._now is None):
+                raise ValueError("give now at each tick or at none; to change, call reset() in between")
+            if self._several and len(_first_leaf(observation)) != len(executions):
+                raise ValueError(
+                    f"there are {len(_first_leaf(observation))} observations, and there were {len(executions)}: "
+                    "call reset() before their number changes"
+                )
+        if now is not None:
+            return self._at(observation, float(now))
+
+        due = [i for i, e in enumerate(executions) if e.tick >= e.n_steps]
+        if due or not executions:
+            self._decide(observation, due, 0.0)
+            executions = self._executions
+        actions = []
+        for e in executions:
+            actions.append(e.plan[e.tick])
+            e.tick += 1
+        return np.stack(actions) if self._several else actions[0]
+
+    def _at(self, observation: Observation, now: float) -> np.ndarray:
+        if not (np.isfinite(now) and (self._now is None or now >= self._now)):
+            raise ValueError(f"now must be finite and must not run backwards, and it is {now} s after {self._now} s")
+        dt = self.settings.dt
+        due = [i for i, e in enumerate(self._executions) if now - e.start >= (e.n_steps - 0.5) * dt]
+        if due or not self._executions:
+            self._decide(observation, due, now)
+        self._now = now
+        actions = []
+        for e in self._executions:
+            # A late tick may find the phase past its end, where the option holds its last action.
+            phase = min((now - e.start) / (e.n_steps * dt), 1.0)
+            trajectory = basis(np.array([phase]), self.settings.n_rbf) @ e.omega.T
+            actions.append(primitive_actions(trajectory, self._low, self._high)[0])
+        return np.stack(actions) if self._several else actions[0]
+
+    def _decide(self, observation: Observation, due: list[int], now: float) -> None:
+        if not self._executions:
+            options = np.asarray(self.policy(observation))
+            self._several = options.ndim == 2
+            self._executions = [self._begin(option, now) for option in np.atleast_2d(options)]
+            return
+        if self._several and len(due) < len(self._executions):
+            if isinstance(observation, dict):
+                observation = {key: np.asarray(value)[due] for key, value in observation.items()}
+            else:
+                observation = np.asarray(observation)[due]
+        for i, option in zip(due, np.atleast_2d(self.policy(observation)), strict=True):
+            self._executions[i] = self._begin(option, now)
+
+    def _begin(self, option: np.ndarray, now: float) -> _Execution:
+        # As OptionExecutionWrapper does, in the same precision.
+        option = np.clip(option.astype(np.float64), -1.0, 1.0)
+        omega, n_steps = self.settings.decode(option)
+        plan = primitive_actions(action_plan(omega, n_steps), self._low, self._high)
+        return _Execution(option, omega, n_steps, plan, start=now)
+
+    @property
+    def option(self) -> np.ndarray:
+        """The option that runs, normalised to [−1, 1]: ``[option_dim]``, or ``[n, option_dim]``."""
+        return self._for_each([e.option for e in self._running()])
+
+    @property
+    def duration(self) -> Any:
+        """How long the running option takes, in s: a number, or an array ``[n]``."""
+        return self._for_each([e.n_steps * self.settings.dt for e in self._running()])
+
+    @property
+    def elapsed(self) -> Any:
+        """How long it had been running at the last tick, in s; 0 if it was chosen then: a number, or an array ``[n]``."""
+        if self._now is None:
+            return self._for_each([(e.tick - 1) * self.settings.dt for e in self._running()])
+        return self._for_each([self._now - e.start for e in self._running()])
+
+    @property
+    def remaining(self) -> Any:
+        """How long it had to run at the last tick, in s, at least 0: a number, or an array ``[n]``."""
+        return self._for_each(np.maximum(np.asarray(self.duration) - self.elapsed, 0.0).reshape(-1).tolist())
+
+    def _running(self) -> list[_Execution]:
+        if not self._executions:
+            raise ValueError("no option runs: call the controller with an observation first")
+        return self._executions
+
+    def _for_each(self, values: list[Any]) -> Any:
+        return np.stack(values) if self._several else values[0]
+
+
+def _first_leaf(observation: Observation) -> npt.NDArray[Any]:
+    return next(iter(observation.values())) if isinstance(observation, dict) else observation
+
+
+def _as_policy(policy: Any, deterministic: bool, vec_normalize: Any) -> OptionPolicy:
+    if not isinstance(policy, str | Path):
+        if callable(policy):
+            return policy
+        return ModelPolicy(policy, deterministic, _load_vec_normalize(vec_normalize))
+    path = Path(policy)
+    if path.suffix == ".onnx":
+        if vec_normalize is not None or not deterministic:
+            raise ValueError("an exported policy acts greedily and normalises by itself: pass no vec_normalize, deterministic")
+        if not path.exists():
+            raise FileNotFoundError(f"{path} does not exist")
+        return OnnxPolicy(path)
+    if path.suffix not in ("", ".zip"):
+        raise ValueError(f"{path} must be a model saved as .zip or exported as .onnx")
+    # Here, because an exported policy needs none of this.
+    from sb3_ctco.ctco import CTCO  # noqa: PLC0415
+
+    return ModelPolicy(CTCO.load(path, device="cpu"), deterministic, _load_vec_normalize(vec_normalize))
+
+
+def _load_vec_normalize(vec_normalize: Any) -> Any:
+    if not isinstance(vec_normalize, str | Path):
+        return vec_normalize
+    with Path(vec_normalize).open("rb") as file:
+        # VecNormalize.load asks for an environment, which a controller has not.
+        return pickle.load(file)

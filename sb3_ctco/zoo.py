@@ -1,0 +1,193 @@
+"""RL Zoo (rl_zoo3) with the algorithms and environments of this package.
+
+``sb3-ctco train``, ``sb3-ctco enjoy`` and ``sb3-ctco tune`` take the Zoo's own flags::
+
+    sb3-ctco train --env Pendulum-v1
+    sb3-ctco enjoy --env Pendulum-v1
+    sb3-ctco tune --env Pendulum-v1 --n-trials 50
+
+Importing this module registers the algorithms and their samplers with the Zoo. ``python -m rl_zoo3.train`` itself cannot
+know them: it checks ``--algo`` before it imports ``--gym-packages``.
+"""
+
+import argparse
+import copy
+import inspect
+import sys
+from collections.abc import Sequence
+from importlib import resources
+from typing import Any
+
+try:
+    import optuna
+    import rl_zoo3.enjoy
+    import rl_zoo3.train
+    from rl_zoo3.exp_manager import ExperimentManager
+    from rl_zoo3.hyperparams_opt import HYPERPARAMS_CONVERTER, HYPERPARAMS_SAMPLER
+    from rl_zoo3.utils import ALGOS, get_wrapper_class
+except ImportError as error:  # pragma: no cover
+    raise ImportError("training through RL Zoo needs rl_zoo3: pip install 'sb3-ctco[zoo]'") from error
+from stable_baselines3.common.base_class import BaseAlgorithm
+from stable_baselines3.common.vec_env import VecEnv
+
+from sb3_ctco.common.option_algorithm import OptionOffPolicyAlgorithm
+from sb3_ctco.ctco import CTCO
+from sb3_ctco.options import discount_rate_from_gamma
+
+#: The package's algorithms by their names in the Zoo.
+ALGORITHMS: dict[str, type[BaseAlgorithm]] = {"ctco": CTCO}
+
+WRAPPER = "sb3_ctco.wrappers.OptionExecutionWrapper"
+
+
+def convert_ctco_params(sampled_params: dict[str, Any]) -> dict[str, Any]:
+    """CTCO's arguments from what :func:`sample_ctco_params` suggested (and Optuna stored)."""
+    hyperparams = dict(sampled_params)
+    for name in ("ent_coef", "duration_ent_coef"):
+        hyperparams[name] = f"auto_{hyperparams.pop(f'{name}_start')}"
+    # In place of a file's gradient_steps, which updates_per_second contradicts.
+    hyperparams["gradient_steps"] = -1
+    return hyperparams
+
+
+def sample_ctco_params(trial: optuna.Trial, n_actions: int, n_envs: int, additional_args: dict[str, Any]) -> dict[str, Any]:
+    """Optuna sampler for what CTCO has and SAC has not, and the step size.
+
+    ``gamma`` and ``gamma_dt`` are not sampled, because they say what is to be optimised.
+
+    :param trial: Optuna's
+    :param n_actions: size of the option space, unused
+    :param n_envs: number of environments, unused
+    :param additional_args: the Zoo's, unused
+    :return: arguments of CTCO
+    """
+    return convert_ctco_params(
+        {
+            "n_rbf": trial.suggest_int("n_rbf", 1, 5),
+            "d_max": trial.suggest_float("d_max", 0.1, 2.0, log=True),
+            "high_freq_penalty": trial.suggest_float("high_freq_penalty", 1e-4, 0.1, log=True),
+            "ent_coef_start": trial.suggest_float("ent_coef_start", 0.005, 1.0, log=True),
+            "duration_ent_coef_start": trial.suggest_float("duration_ent_coef_start", 0.005, 1.0, log=True),
+            "learning_rate": trial.suggest_float("learning_rate", 1e-4, 3e-3, log=True),
+            "duration_learning_rate": trial.suggest_float("duration_learning_rate", 1e-5, 3e-3, log=True),
+            "updates_per_second": trial.suggest_float("updates_per_second", 5.0, 60.0, log=True),
+        }
+    )
+
+
+class OptionExperimentManager(ExperimentManager):
+    """The Zoo's ``ExperimentManager``, which wraps environments for algorithms that decide by options.
+
+    The Zoo makes its environments before the algorithm, which cannot wrap them then. Here they get an
+    :class:`~sb3_ctco.wrappers.OptionExecutionWrapper`, around the ``env_wrapper`` that a file may name, with the
+    algorithm's settings; so that a file, the command line and a sampler name these once. An OptionExecutionWrapper in
+    the file is left as it is.
+    """
+
+    _option_hyperparams: dict[str, Any] | None = None
+    _trial: optuna.Trial | None = None
+
+    def read_hyperparameters(self) -> tuple[dict[str, Any], dict[str, Any]]:
+        """The Zoo's, with the wrapper added; also in what is saved, so that ``enjoy`` finds it."""
+        hyperparams, saved = super().read_hyperparameters()
+        if issubclass(ALGOS[self.algo], OptionOffPolicyAlgorithm):
+            self._option_hyperparams = dict(hyperparams)
+            hyperparams["env_wrapper"] = saved["env_wrapper"] = self._wrappers(hyperparams)
+        return hyperparams, saved
+
+    def objective(self, trial: optuna.Trial) -> float:
+        """Value of one trial, in environments that share its options' settings."""
+        # A copy, because trials run in threads if --n-jobs is more than one.
+        manager = copy.copy(self)
+        manager._trial = trial
+        return super(OptionExperimentManager, manager).objective(trial)
+
+    def create_envs(self, n_envs: int, eval_env: bool = False, no_log: bool = False) -> VecEnv:
+        """The Zoo's; within a trial with the settings that it sampled."""
+        if self._trial is not None and self._option_hyperparams is not None:
+            # By now the sampler has run, and names of parameters are those of CTCO's arguments.
+            hyperparams = {**self._option_hyperparams, **self._trial.params}
+            self.env_wrapper = get_wrapper_class({"env_wrapper": self._wrappers(hyperparams)})
+        return super().create_envs(n_envs, eval_env, no_log)
+
+    def _wrappers(self, hyperparams: dict[str, Any]) -> list[Any]:
+        given = hyperparams.get("env_wrapper") or []
+        wrappers = list(given) if isinstance(given, list) else [given]
+        if any(WRAPPER in (wrapper if isinstance(wrapper, dict) else [wrapper]) for wrapper in wrappers):
+            return wrappers
+        parameters = inspect.signature(ALGOS[self.algo]).parameters
+        names = ("n_rbf", "d_max", "d_min", "dt", "gamma", "gamma_dt")
+        kwargs = {name: hyperparams.get(name, parameters[name].default) for name in names}
+        kwargs["discount_rate"] = discount_rate_from_gamma(kwargs.pop("gamma"), kwargs.pop("gamma_dt"))
+        return [*wrappers, {WRAPPER: kwargs}]
+
+
+def register() -> None:
+    """Make the algorithms known to the Zoo; once is enough."""
+    ALGOS.update(ALGORITHMS)
+    HYPERPARAMS_SAMPLER["ctco"] = sample_ctco_params
+    HYPERPARAMS_CONVERTER["ctco"] = convert_ctco_params
+
+
+def packaged_config(algo: str) -> str | None:
+    """Path of the hyperparameter file for an algorithm in this package, or None if there is none."""
+    file = resources.files("sb3_ctco.zoo_configs") / f"{algo}.yml"
+    return str(file) if file.is_file() else None
+
+
+def with_defaults(command: str, arguments: Sequence[str]) -> list[str]:
+    """The Zoo's arguments for one of our commands, this package's defaults added where none are given.
+
+    :param command: ``"train"``, ``"tune"`` or ``"enjoy"``
+    :param arguments: as typed
+    """
+    parser = argparse.ArgumentParser(add_help=False)
+    parser.add_argument("--algo")
+    parser.add_argument("-conf", "--conf-file")
+    parser.add_argument("-f", "--folder", "--log-folder")
+    given, _ = parser.parse_known_args(arguments)
+    algo = given.algo or "ctco"
+    defaults = [] if given.algo else ["--algo", algo]
+    if command == "enjoy":
+        # Where train puts it; the Zoo itself looks for its own agents.
+        return [*([] if given.folder else ["--folder", "logs"]), *defaults, *arguments]
+    config = packaged_config(algo)
+    if given.conf_file is None and config is not None:
+        defaults += ["--conf-file", config]
+    if command == "tune":
+        defaults.append("--optimize-hyperparameters")
+    return [*defaults, *arguments]
+
+
+COMMANDS = {
+    "train": "train an agent",
+    "enjoy": "watch an agent that was trained",
+    "tune": "search hyperparameters with Optuna (train --optimize-hyperparameters)",
+}
+
+
+def main(arguments: Sequence[str] | None = None) -> None:
+    """The command ``sb3-ctco``.
+
+    :param arguments: the command and RL Zoo's flags; those of the process by default
+    """
+    parser = argparse.ArgumentParser(
+        prog="sb3-ctco",
+        description="RL Zoo with CTCO. Every command takes RL Zoo's flags; sb3-ctco COMMAND --help lists them.",
+        epilog="\n".join(f"{name:7} {text}" for name, text in COMMANDS.items()),
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    parser.add_argument("command", choices=COMMANDS)
+    parser.add_argument("flags", nargs=argparse.REMAINDER, help="RL Zoo's flags; --algo is ctco by default")
+    args = parser.parse_args(arguments)
+
+    argv, manager = sys.argv, rl_zoo3.train.ExperimentManager
+    sys.argv = [f"sb3-ctco {args.command}", *with_defaults(args.command, args.flags)]
+    rl_zoo3.train.ExperimentManager = OptionExperimentManager  # type: ignore[misc]
+    try:
+        (rl_zoo3.enjoy.enjoy if args.command == "enjoy" else rl_zoo3.train.train)()
+    finally:
+        sys.argv, rl_zoo3.train.ExperimentManager = argv, manager  # type: ignore[misc]
+
+
+register()
