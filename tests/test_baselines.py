@@ -1,8 +1,6 @@
 """What FiGAR-SAC and DAC-PPO have in common with every algorithm of Stable-Baselines3."""
 
-import copy
 import inspect
-from argparse import Namespace
 from importlib import resources
 
 import numpy as np
@@ -189,44 +187,58 @@ def test_it_is_public(algorithm, kwargs):
 
 # --- RL Zoo
 
-CONFIGS = {
-    name: yaml.safe_load((resources.files("sb3_ctco.zoo_configs") / f"{name}.yml").read_text())
-    for name in ("figar_sac", "dac_ppo")
-}
+NAMES = {"figar_sac": FiGARSAC, "dac_ppo": DACPPO}
+CONFIGS = {name: yaml.safe_load((resources.files("sb3_ctco.zoo_configs") / f"{name}.yml").read_text()) for name in NAMES}
 
 
-@pytest.mark.parametrize(("name", "algorithm"), [("figar_sac", FiGARSAC), ("dac_ppo", DACPPO)])
-def test_zoo_settings_are_arguments(name, algorithm):
-    known = {*inspect.signature(algorithm).parameters, "n_timesteps", "n_envs", "normalize", "env_wrapper"}
+@pytest.mark.parametrize("name", NAMES)
+def test_zoo_settings_are_arguments(name):
+    known = {*inspect.signature(NAMES[name]).parameters, "n_timesteps", "n_envs", "normalize"}
+    assert {"default", "Pendulum-v1", "sb3_ctco/ball_in_cup-catch-500hz-v0"} <= set(CONFIGS[name])
     for settings in CONFIGS[name].values():
         assert set(settings) <= known
-        numbers = [value for value in settings.values() if not isinstance(value, dict | list | bool | str)]
-        assert all(isinstance(value, int | float) for value in numbers)
-        assert isinstance(settings["n_timesteps"], float)
+        # YAML reads a bare 1e-3 as a string.
+        assert isinstance(settings["n_timesteps"], int | float)
         assert isinstance(settings.get("learning_rate", 0.1), float)
 
 
-@pytest.mark.parametrize(("name", "algorithm"), [("figar_sac", FiGARSAC), ("dac_ppo", DACPPO)])
-def test_the_zoo_trains_it(name, algorithm, tmp_path, monkeypatch):
-    zoo = pytest.importorskip("rl_zoo3.exp_manager")
-    monkeypatch.setitem(zoo.ALGOS, name, algorithm)
-    config = copy.deepcopy(CONFIGS[name])
-    (tmp_path / "config.yml").write_text(yaml.safe_dump(config))
-    manager = zoo.ExperimentManager(
-        Namespace(conf_file=None),
-        name,
-        "Pendulum-v1",
-        str(tmp_path),
-        n_timesteps=600,
-        eval_freq=-1,
-        log_interval=1,
-        config=str(tmp_path / "config.yml"),
-        verbose=0,
-        device="cpu",
+@pytest.mark.parametrize(
+    ("name", "env_id"), [(name, env_id) for name in NAMES for env_id in CONFIGS[name] if "500hz" not in env_id]
+)
+def test_the_zoo_trains_each_entry(name, env_id, tmp_path, monkeypatch):
+    zoo = pytest.importorskip("sb3_ctco.zoo")
+    trained = []
+    monkeypatch.setattr(zoo.OptionExperimentManager, "save_trained_model", lambda self, model: trained.append(model))
+    env = "MountainCarContinuous-v0" if env_id == "default" else env_id
+    few = (
+        ["learning_starts:50", "buffer_size:500", "batch_size:16"] if name == "figar_sac" else ["n_steps:50", "batch_size:50"]
     )
-    model, _ = manager.setup_experiment()
-    assert isinstance(model, algorithm)
-    manager.learn(model)
-    assert model.num_timesteps >= 600
-    manager.save_trained_model(model)
-    assert (tmp_path / name / "Pendulum-v1_1" / "Pendulum-v1.zip").exists()
+    flags = ["-n", "200", "--eval-freq", "-1", "--seed", "0", "--device", "cpu", "--verbose", "0", "-f", str(tmp_path)]
+    if env_id == "default" and name == "figar_sac":
+        few.append("d_max:0.5")  # whole steps at 30 Hz
+    zoo.main(["train", "--algo", name, "--env", env, *flags, "-params", *few])
+    (model,) = trained
+    assert type(model) is NAMES[name]
+    assert model.num_timesteps >= 200
+    assert model._n_updates > 0
+    assert all(th.isfinite(p).all() for p in model.policy.parameters())
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_enjoy_after_train(name, tmp_path, capsys):
+    zoo = pytest.importorskip("sb3_ctco.zoo")
+    few = ["learning_starts:50", "batch_size:16"] if name == "figar_sac" else ["n_envs:1", "n_steps:50", "batch_size:50"]
+    flags = ["--algo", name, "--env", "Pendulum-v1", "-f", str(tmp_path)]
+    zoo.main(["train", *flags, "-n", "200", "--eval-freq", "-1", "--device", "cpu", "-params", *few])
+    capsys.readouterr()
+    zoo.main(["enjoy", *flags, "--no-render", "-n", "250"])
+    assert "Mean reward: -" in capsys.readouterr().out
+
+
+def test_the_zoo_needs_seconds_for_repetitions():
+    arguments = {"n_repetitions": 4, "d_max": None, "dt": None, "gamma": 0.98, "gamma_dt": 0.05}
+    with pytest.raises(ValueError, match="pass d_max, in seconds, or dt"):
+        FiGARSAC.wrapper_kwargs(arguments)
+    kwargs = FiGARSAC.wrapper_kwargs({**arguments, "dt": 0.1})
+    assert (kwargs["n_rbf"], kwargs["d_max"], kwargs["d_min"], kwargs["dt"]) == (1, 0.4, None, 0.1)
+    assert FiGARSAC.wrapper_kwargs({**arguments, "n_repetitions": None, "d_max": 0.3})["d_max"] == 0.3

@@ -200,6 +200,23 @@ class FiGARSAC(SoftOptionActorCritic):
         if _init_setup_model:
             self._setup_model()
 
+    @classmethod
+    def wrapper_kwargs(cls, arguments: dict[str, Any]) -> dict[str, Any]:
+        """OptionExecutionWrapper's arguments for the algorithm's, where environments are made before it.
+
+        :param arguments: the algorithm's arguments, defaults included
+        :raises ValueError: if they do not tell how many seconds the longest repetition takes
+        """
+        n_repetitions, d_max, dt = arguments["n_repetitions"], arguments["d_max"], arguments["dt"]
+        if d_max is None and dt is None:
+            raise ValueError(
+                f"how long n_repetitions={n_repetitions} steps take is not known before the environment is made: pass d_max, "
+                "in seconds, or dt"
+            )
+        if d_max is None:
+            d_max = (20 if n_repetitions is None else n_repetitions) * dt
+        return super().wrapper_kwargs({**arguments, "n_rbf": 1, "d_max": d_max, "d_min": None})
+
     def _resolve_repetitions(self, dt: float) -> None:
         """Make ``n_repetitions`` and ``d_max``, of which the user gave one, say the same at the first dt that is known."""
         if self.n_repetitions is None or self.d_max is None:
