@@ -224,15 +224,17 @@ class FiGARSAC(SoftOptionActorCritic):
                 self.n_repetitions = steps_in(self.d_max, dt)
             self.d_max = self.n_repetitions * dt
 
-    def wrap_env(self, env: gym.Env) -> OptionExecutionWrapper:
+    def wrap_env(self, env: gym.Env, n_sub_options: int = 0) -> OptionExecutionWrapper:
         """Wrap a bare environment as the algorithm wraps its own, for instance to evaluate in it.
 
+        :param env: the bare environment
+        :param n_sub_options: see :class:`~sb3_ctco.wrappers.OptionExecutionWrapper`; FiGAR-SAC learns without
         :return: ``OptionExecutionWrapper(Monitor(env), n_rbf=1, d_max=K * dt)``, a Monitor being added where there is none
         """
         dt = self.dt if self._dt_was_given else find_dt(env)
         if dt is not None:
             self._resolve_repetitions(dt)
-        return super().wrap_env(env)
+        return super().wrap_env(env, n_sub_options)
 
     def _as_option_env(self, env: GymEnv) -> GymEnv:
         env = super()._as_option_env(env)
