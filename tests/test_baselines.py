@@ -11,6 +11,7 @@ from stable_baselines3.common.callbacks import CheckpointCallback, EvalCallback
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.evaluation import evaluate_policy
 from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecNormalize
+from test_can_i_use import SPACES, VECTOR, SpacesEnv, table
 
 import sb3_ctco
 from sb3_ctco import DACPPO, FiGARSAC, OptionExecutionWrapper
@@ -183,6 +184,25 @@ def test_it_is_public(algorithm, kwargs):
     # Every argument has its line of documentation.
     for name in inspect.signature(algorithm).parameters:
         assert f":param {name}:" in algorithm.__doc__
+
+
+# --- what the pages say
+
+
+@ALGORITHMS
+@pytest.mark.parametrize("kind", SPACES)
+def test_spaces(algorithm, kwargs, kind):
+    page = {FiGARSAC: "figar_sac", DACPPO: "dac_ppo"}[algorithm]
+    action, observation = table(page, "| Space | Action | Observation |")[kind]
+    policy = "MultiInputPolicy" if kind == "Dict" else "MlpPolicy"
+    assert observation == "✓"
+    make(algorithm, SpacesEnv(SPACES[kind], VECTOR), kwargs, policy).learn(30)
+    if action.startswith("✓"):
+        make(algorithm, SpacesEnv(VECTOR, SPACES[kind]), kwargs).learn(30)
+    else:
+        # DACPPO leaves it to Stable-Baselines3 to refuse them.
+        with pytest.raises((TypeError, AssertionError), match="action space"):
+            make(algorithm, SpacesEnv(VECTOR, SPACES[kind]), kwargs)
 
 
 # --- RL Zoo

@@ -523,11 +523,11 @@ def test_options_specialise_on_a_bandit(scripted_env):
 
 @pytest.mark.slow
 def test_dac_ppo_learns_pendulum():
-    """A third of the 300,000 steps for which docs/dac_ppo.md has figures; a random policy has about −1200."""
+    """From about −1200 of a random policy, in a third of the 300,000 steps for which docs/dac_ppo.md has figures."""
     env = VecNormalize(make_vec_env("Pendulum-v1", 8, seed=0), gamma=0.9)
     model = DACPPO("MlpPolicy", env, n_steps=256, batch_size=256, gamma=0.9, learning_rate=1e-3, seed=0, device="cpu")
     model.learn(100_000)
     env.training, env.norm_reward = False, False
     env.seed(1000)
     mean_return, _ = evaluate_policy(model, env, n_eval_episodes=40)
-    assert mean_return > -900
+    assert mean_return > -600

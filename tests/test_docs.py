@@ -8,6 +8,7 @@ from pathlib import Path
 import matplotlib as mpl
 import pytest
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
+from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
 
 mpl.use("Agg")
 ROOT = Path(__file__).parent.parent
@@ -18,12 +19,12 @@ PAGES = sorted(page for page in (ROOT / "docs").glob("*.md") if "```python" in p
 def test_snippets_run(page, tmp_path, monkeypatch):
     """All Python blocks of a page, one after the other in one namespace, with short trainings."""
     monkeypatch.chdir(tmp_path)
-    learn = OffPolicyAlgorithm.learn
+    for base in (OffPolicyAlgorithm, OnPolicyAlgorithm):
 
-    def short(self, total_timesteps, *args, **kwargs):
-        return learn(self, min(total_timesteps, 300), *args, **kwargs)
+        def short(self, total_timesteps, *args, learn=base.learn, **kwargs):
+            return learn(self, min(total_timesteps, 300), *args, **kwargs)
 
-    monkeypatch.setattr(OffPolicyAlgorithm, "learn", short)
+        monkeypatch.setattr(base, "learn", short)
     namespace: dict[str, object] = {}
     for block in re.findall(r"```python\n(.*?)```", page.read_text(), re.DOTALL):
         exec(compile(block, page.name, "exec"), namespace)

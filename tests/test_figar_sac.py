@@ -14,8 +14,9 @@ from stable_baselines3.common.evaluation import evaluate_policy
 from stable_baselines3.common.noise import NormalActionNoise
 from stable_baselines3.common.type_aliases import ReplayBufferSamples
 
-from sb3_ctco import FiGARSAC, OptionExecutionWrapper, RewardRateWrapper
+from sb3_ctco import FiGARSAC, OptionController, OptionExecutionWrapper, RewardRateWrapper
 from sb3_ctco.common import soft_actor_critic
+from sb3_ctco.export import export_onnx
 from sb3_ctco.figar_sac.figar_sac import actor_loss, repetition_values
 from sb3_ctco.figar_sac.policies import FiGARSACPolicy, decode_repetitions, encode_repetitions
 from sb3_ctco.options import OptionSettings, discount
@@ -378,6 +379,20 @@ def test_critic_targets_are_an_exact_expectation(seed):
             log_prob = log_probs[row, k].item()
             total += math.exp(log_prob) * (min(q_values[0, row, k].item(), q_values[1, row, k].item()) - 0.3 * log_prob)
         assert values[row].item() == pytest.approx(total, abs=1e-5)
+
+
+def test_an_exported_policy_acts_as_the_model(tmp_path):
+    for name in ("onnx", "onnxscript", "onnxruntime"):
+        pytest.importorskip(name)
+    model = FiGARSAC("MlpPolicy", gym.make("Pendulum-v1"), n_repetitions=7, **{**SMALL, "seed": 1})
+    export_onnx(model, tmp_path / "policy.onnx")
+    exported, direct = OptionController(tmp_path / "policy.onnx"), OptionController(model)
+    env = gym.make("Pendulum-v1")
+    obs, _ = env.reset(seed=0)
+    for _ in range(30):
+        action = direct(obs)
+        np.testing.assert_allclose(exported(obs), action, atol=1e-5)
+        obs, *_ = env.step(action)
 
 
 # --- learning

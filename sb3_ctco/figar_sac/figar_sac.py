@@ -228,7 +228,7 @@ class FiGARSAC(SoftOptionActorCritic):
         """Wrap a bare environment as the algorithm wraps its own, for instance to evaluate in it.
 
         :param env: the bare environment
-        :param n_sub_options: as for CTCO
+        :param n_sub_options: see :class:`~sb3_ctco.wrappers.OptionExecutionWrapper`; FiGAR-SAC learns without
         :return: ``OptionExecutionWrapper(Monitor(env), n_rbf=1, d_max=K * dt)``, a Monitor being added where there is none
         """
         dt = self.dt if self._dt_was_given else find_dt(env)

@@ -75,7 +75,7 @@ class FiGARActor(SquashedActor):
         return data
 
     def distribution_parameters(self, obs: PyTorchObs) -> tuple[th.Tensor, th.Tensor, th.Tensor]:
-        """Mean and log standard deviation of an action before squashing, each ``[batch, action_dim]``, and log π_x(·|s).
+        """Mean and log standard deviation of an action before squashing, each ``[batch, action_dim]``, and ``log π_x(·|s)``.
 
         :return: the last one ``[batch, K]``
         """
@@ -86,8 +86,8 @@ class FiGARActor(SquashedActor):
     def action_log_prob(self, obs: PyTorchObs) -> tuple[th.Tensor, th.Tensor, th.Tensor]:
         """Reparameterised sample of an action, and the distribution of its repetition.
 
-        :return: actions ``[batch, action_dim]`` in [−1, 1], log π_a(a|s) as a density over that box ``[batch]``, and
-            log π_x(·|s) ``[batch, K]``
+        :return: actions ``[batch, action_dim]`` in [−1, 1], ``log π_a(a|s)`` as a density over that box ``[batch]``, and
+            ``log π_x(·|s)`` ``[batch, K]``
         """
         mean, log_std, repetition_log_probs = self.distribution_parameters(obs)
         noise = th.randn_like(mean)
