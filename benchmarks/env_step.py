@@ -20,7 +20,12 @@ with warnings.catch_warnings():
     warnings.simplefilter("ignore")  # glfw, without a display
     from shimmy.dm_control_compatibility import DmControlCompatibilityV0
 
-TASKS = [("point_mass", "easy", False), ("point_mass", "easy", True), ("cheetah", "run", False), ("ball_in_cup", "catch", False)]
+TASKS = [
+    ("point_mass", "easy", False),
+    ("point_mass", "easy", True),
+    ("cheetah", "run", False),
+    ("ball_in_cup", "catch", False),
+]
 
 
 def make_ours(domain: str, task: str, sparse: bool, dt: float) -> gym.Env:

@@ -109,6 +109,27 @@ def action_plan(omega: FloatArray, n_steps: int) -> FloatArray:
     return basis_of_steps(n_steps, omega.shape[1]) @ omega.T
 
 
+@lru_cache(maxsize=4096)
+def _pseudo_inverse(n_steps: int, n_rbf: int) -> FloatArray:
+    """What turns an action plan of n steps into the weights that fit it best, ``[n_rbf, n_steps]``."""
+    return np.linalg.pinv(basis_of_steps(n_steps, n_rbf))
+
+
+def fit_weights(plan: FloatArray, n_rbf: int) -> tuple[FloatArray, float]:
+    """The option of as many steps whose actions come closest to a plan: least squares, clipped to [−1, 1].
+
+    Exact for ``n_rbf=1`` and a constant plan, and for the plan of an option of the same length.
+
+    :param plan: normalised actions, shape ``[n_steps, action_dim]``
+    :param n_rbf: number of basis functions
+    :return: ω, shape ``[action_dim, n_rbf]``, and the residual, the largest deviation of an action from the plan
+    """
+    n_steps = len(plan)
+    omega = (_pseudo_inverse(n_steps, n_rbf) @ plan).clip(-1.0, 1.0)
+    residual = float(np.abs(basis_of_steps(n_steps, n_rbf) @ omega - plan).max())
+    return omega.T, residual
+
+
 def primitive_actions(trajectory: FloatArray, low: npt.NDArray[Any], high: npt.NDArray[Any]) -> npt.NDArray[Any]:
     """Normalised actions in the units of an action box.
 
@@ -190,6 +211,17 @@ class OptionSettings:
     def duration(self, option: FloatArray) -> float:
         """The duration d that an option vector asks for, in s: its last entry, mapped from [−1, 1] to [d_min, d_max]."""
         return self.d_min + 0.5 * (float(option[-1]) + 1.0) * (self.d_max - self.d_min)
+
+    def encode(self, omega: FloatArray, n_steps: int) -> FloatArray:
+        """The option vector that :meth:`decode` turns into these; d_min = d_max is encoded as 0.
+
+        :param omega: shape ``[action_dim, n_rbf]``
+        :param n_steps: number of primitive steps
+        :return: shape ``[action_dim · n_rbf + 1]``, float32
+        """
+        width = self.d_max - self.d_min
+        entry = 2.0 * (n_steps * self.dt - self.d_min) / width - 1.0 if width > 0 else 0.0
+        return np.append(omega, min(max(entry, -1.0), 1.0)).astype(np.float32)
 
     def decode(self, option: FloatArray) -> tuple[FloatArray, int]:
         """Split an option vector.

@@ -34,7 +34,7 @@ def observation(kind, value, n_envs=1):
 
 
 def add(buffer, kind, value, infos, done=False):
-    n = buffer.n_envs
+    n = len(infos)
     action = np.full((n, 3), value / 10, dtype=np.float32)
     reward, dones = np.full(n, 99.0), np.full(n, done)
     buffer.add(observation(kind, value, n), observation(kind, value + 1, n), action, reward, dones, infos)
@@ -61,6 +61,7 @@ def test_a_sample_has_the_integral_and_the_discount(kind):
 @pytest.mark.parametrize("kind", ["vector", "dict"])
 def test_rows_of_several_environments_stay_together(kind):
     buffer = make_buffer(kind, n_envs=2, size=20)
+    assert buffer.durations.shape == (20, 1)
     for value in range(10):
         add(buffer, kind, value, [option_info(value / 2, value), option_info(value / 4, -value)])
     assert buffer.full
@@ -145,7 +146,7 @@ def test_stock_algorithms_learn_on_the_semi_markov_process(algorithm, n_envs):
     model.learn(60)
     buffer = model.replay_buffer
     stored = slice(0, buffer.pos)
-    assert buffer.pos == 60 // n_envs
+    assert buffer.pos == 60
     # With reward="integral" what Stable-Baselines3 stored is R as well.
     np.testing.assert_allclose(buffer.rewards[stored], buffer.integrated_rewards[stored], rtol=1e-6)
     assert (buffer.durations[stored] >= 0.05 - 1e-6).all()

@@ -328,7 +328,7 @@ def test_environments_that_disagree_among_themselves(random_walk_env):
 def test_several_wrapped_environments(vec_env_cls, random_walk_env):
     env = make_vec_env(random_walk_env, n_envs=2, wrapper_class=OptionExecutionWrapper, vec_env_cls=vec_env_cls, seed=0)
     model = make(env).learn(120)
-    assert model.replay_buffer.n_envs == 2
+    assert model.n_envs == 2
     assert model._n_updates > 0
     env.close()
 
@@ -466,7 +466,7 @@ def test_save_and_load(tmp_path, random_walk_env):
         wrapper_class=OptionExecutionWrapper,
         wrapper_kwargs={"n_rbf": 2, "d_max": 0.7, "d_min": 0.2},
     )
-    assert CTCO.load(tmp_path / "model", env=two).learn(30).replay_buffer.n_envs == 2
+    assert CTCO.load(tmp_path / "model", env=two).learn(30).n_envs == 2
 
     for other in ({"n_rbf": 2, "d_max": 0.6, "d_min": 0.2}, {"n_rbf": 2, "d_max": 0.7}):
         with pytest.raises(ValueError, match="options have d_m"):

@@ -15,6 +15,7 @@ from sb3_ctco.options import (
     basis_of_steps,
     discount,
     discount_rate_from_gamma,
+    fit_weights,
     integrated_reward,
     step_weight,
     steps_in,
@@ -176,3 +177,52 @@ def test_settings_out_of_range(change, error):
     OptionSettings(**good)
     with pytest.raises(error, match=next(iter(change))):
         OptionSettings(**{**good, **change})
+
+
+# --- sub-options
+
+
+@given(
+    hnp.arrays(np.float64, st.tuples(st.integers(1, 3), st.integers(1, 5)), elements=st.floats(-1, 1)),
+    st.integers(1, 60),
+)
+def test_a_fit_over_the_whole_option_returns_its_weights(omega, n_steps):
+    fitted, residual = fit_weights(action_plan(omega, n_steps), omega.shape[1])
+    assert residual < 1e-9
+    if n_steps >= 2 * omega.shape[1]:  # enough steps to tell the weights apart
+        np.testing.assert_allclose(fitted, omega, atol=1e-6)
+
+
+def test_slices_of_repeated_actions_are_exact():
+    plan = action_plan(np.array([[0.3], [-1.0]]), 17)
+    for first, last in ((0, 1), (3, 9), (16, 17), (1, 17)):
+        omega, residual = fit_weights(plan[first:last], 1)
+        np.testing.assert_allclose(omega, [[0.3], [-1.0]], atol=1e-12)
+        assert residual < 1e-12
+
+
+def test_a_fit_is_the_least_squares_one_and_says_how_far_off_it_is():
+    # Two basis functions, two steps, at phases 0 and ½: rows (p, 1 − p) with p = 1/(1 + e^(−8/3)), and (½, ½).
+    p = 1 / (1 + math.exp(-8 / 3))
+    # ω = (u, v) with pu + (1 − p)v = 0.4 and (u + v)/2 = 0.1
+    v = (0.4 - 0.2 * p) / (1 - 2 * p)
+    omega, residual = fit_weights(np.array([[0.4], [0.1]]), 2)
+    np.testing.assert_allclose(omega, [[0.2 - v, v]], atol=1e-9)
+    assert residual < 1e-9
+    # A plan that leaves the box of the weights is clipped, and the deviation told.
+    omega, residual = fit_weights(np.array([[1.0], [-1.0]]), 2)
+    assert np.abs(omega).max() <= 1.0
+    plan = action_plan(omega, 2)
+    assert residual == pytest.approx(np.abs(plan - [[1.0], [-1.0]]).max())
+    assert residual > 0.05
+
+
+def test_encode_is_the_inverse_of_decode():
+    settings = OptionSettings(n_rbf=2, d_max=1.0, d_min=0.1, dt=0.1, discount_rate=0.4)
+    omega = np.array([[0.1, 0.2], [-0.3, 0.4]])
+    for n_steps in range(1, 11):
+        again, steps = settings.decode(settings.encode(omega, n_steps))
+        np.testing.assert_allclose(again, omega, rtol=1e-6)
+        assert steps == n_steps
+    fixed = OptionSettings(n_rbf=2, d_max=0.3, d_min=0.3, dt=0.1, discount_rate=0.4)
+    assert fixed.decode(fixed.encode(omega, 3))[1] == 3

@@ -1,6 +1,11 @@
 """Play options, smooth action trajectories of variable duration, in an environment with a fixed step."""
 
-from collections.abc import Callable
+import inspect
+import itertools
+import math
+from collections.abc import Callable, Sequence
+from copy import deepcopy
+from dataclasses import dataclass
 from types import SimpleNamespace
 from typing import Any, Literal, Protocol, SupportsFloat, runtime_checkable
 
@@ -20,25 +25,30 @@ from sb3_ctco.options import (
     RewardUnit,
     action_plan,
     discount,
+    fit_weights,
     integrated_reward,
     primitive_actions,
+    step_weight,
 )
 
 SequenceResult = tuple[Any, npt.ArrayLike, bool, bool, dict[str, Any]]
-StepSequence = Callable[[np.ndarray], SequenceResult]
+StepSequence = Callable[..., SequenceResult]
 
 
 @runtime_checkable
 class SupportsStepSequence(Protocol):
     """An environment that can play several actions at once, without computing what nobody sees.
 
-    ``step_sequence(actions)`` is ``step`` in a loop: it plays ``actions`` (shape ``[n_steps, *action_shape]``) until
-    they run out or the episode ends, and returns the last observation, the reward of each step that ran, whether the
-    last step terminated or truncated the episode, and the last step's info.
+    ``step_sequence(actions, observe)`` is ``step`` in a loop: it plays ``actions`` (shape ``[n_steps, *action_shape]``)
+    until they run out or the episode ends, and returns the last observation, the reward of each step that ran, whether
+    the last step terminated or truncated the episode, and the last step's info. ``observe`` lists, in increasing order
+    and below ``n_steps``, the numbers of steps after which the observation is wanted, too: ``info["observations"]`` has
+    those that came before the episode's end, in a list. It is passed only if sub-options are wanted
+    (``n_sub_options``); an environment whose ``step_sequence(actions)`` does not take it is stepped in a loop then.
     """
 
-    def step_sequence(self, actions: np.ndarray) -> SequenceResult:
-        """Play actions ``[n_steps, *action_shape]``."""
+    def step_sequence(self, actions: np.ndarray, observe: Sequence[int] = ()) -> SequenceResult:
+        """Play actions ``[n_steps, *action_shape]``, observing after some numbers of steps."""
         ...
 
 
@@ -58,6 +68,39 @@ def find_dt(env: gym.Env) -> float | None:
         render_fps = (env.metadata or {}).get("render_fps")
         dt = 1.0 / float(render_fps) if render_fps else None
     return None if dt is None else float(dt)
+
+
+@dataclass(frozen=True)
+class SubOptions:
+    """Shorter options that an option contained, as transitions: ``info["sub_options"]``.
+
+    Every field has one entry a sub-option.
+
+    :param observations: where they began
+    :param next_observations: where they ended
+    :param options: option vectors, float32 ``[n, option_dim]``
+    :param durations: in s, ``[n]``
+    :param integrated_rewards: R of each, ``[n]``
+    :param terminated: whether the episode terminated with it, ``[n]``
+    :param truncated: whether it was truncated with it, ``[n]``
+    :param residuals: largest deviation of its actions from those that were played, normalised, ``[n]``
+    """
+
+    observations: list[Any]
+    next_observations: list[Any]
+    options: np.ndarray
+    durations: np.ndarray
+    integrated_rewards: np.ndarray
+    terminated: np.ndarray
+    truncated: np.ndarray
+    residuals: np.ndarray
+
+    def __len__(self) -> int:
+        return len(self.options)
+
+    def __deepcopy__(self, memo: dict[int, Any]) -> "SubOptions":
+        # Stable-Baselines3 copies infos deeply; what nobody writes to need not be copied.
+        return self
 
 
 class OptionExecutionWrapper(gym.Wrapper, RecordConstructorArgs):
@@ -95,6 +138,10 @@ class OptionExecutionWrapper(gym.Wrapper, RecordConstructorArgs):
     :param reward: what ``step`` returns as reward: ``"sum"`` of the primitive rewards, which makes returns comparable
         with an agent of fixed rate, or ``"integral"``, R, for use under an algorithm that knows nothing of options
     :param reward_unit: ``"rate"`` if rewards do not shrink with dt, ``"impulse"`` if they are paid per event
+    :param n_sub_options: how many random stretches of each option to hand over as options of their own, in
+        ``info["sub_options"]`` (:class:`SubOptions`), for a replay buffer that learns from them
+    :param sub_option_tolerance: leave out a sub-option if its actions deviate by more from those that were played;
+        actions count as normalised to [−1, 1]
     :raises TypeError: if the action space is not a ``Box``
     :raises ValueError: if its bounds are not finite, a setting is out of range, or dt is not given and not found
     """
@@ -111,6 +158,8 @@ class OptionExecutionWrapper(gym.Wrapper, RecordConstructorArgs):
         discount_rate: float = DEFAULT_DISCOUNT_RATE,
         reward: Literal["sum", "integral"] = "sum",
         reward_unit: RewardUnit = "rate",
+        n_sub_options: int = 0,
+        sub_option_tolerance: float = 0.1,
     ):
         RecordConstructorArgs.__init__(
             self,
@@ -121,6 +170,8 @@ class OptionExecutionWrapper(gym.Wrapper, RecordConstructorArgs):
             discount_rate=discount_rate,
             reward=reward,
             reward_unit=reward_unit,
+            n_sub_options=n_sub_options,
+            sub_option_tolerance=sub_option_tolerance,
         )
         gym.Wrapper.__init__(self, env)
 
@@ -138,6 +189,10 @@ class OptionExecutionWrapper(gym.Wrapper, RecordConstructorArgs):
             raise ValueError(f"reward must be 'sum' or 'integral', not {reward!r}")
         if reward_unit not in REWARD_UNITS:
             raise ValueError(f"reward_unit must be one of {REWARD_UNITS}, not {reward_unit!r}")
+        if n_sub_options < 0:
+            raise ValueError(f"n_sub_options must be at least 0, not {n_sub_options}")
+        if not sub_option_tolerance >= 0:
+            raise ValueError(f"sub_option_tolerance must be at least 0, not {sub_option_tolerance}")
         if dt is None:
             dt = find_dt(env)
         if dt is None:
@@ -161,10 +216,19 @@ class OptionExecutionWrapper(gym.Wrapper, RecordConstructorArgs):
         )
         self._play: StepSequence | None = None
 
+        self.n_sub_options = n_sub_options
+        self.sub_option_tolerance = sub_option_tolerance
+        # A generator of its own, so that sub-options change nothing in what the environment does.
+        self._slice_rng = np.random.default_rng()
+        self._last_obs: Any = None
+
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
         """Reset the inner environment."""
         result = self.env.reset(seed=seed, options=options)
-        self._play = _find_step_sequence(self.env) or self._step_in_a_loop
+        if seed is not None:
+            self._slice_rng = np.random.default_rng(seed)
+        self._last_obs = deepcopy(result[0]) if self.n_sub_options else None
+        self._play = _find_step_sequence(self.env, self.n_sub_options > 0) or self._step_in_a_loop
         return result
 
     def step(self, action: npt.ArrayLike) -> tuple[Any, SupportsFloat, bool, bool, dict[str, Any]]:
@@ -185,7 +249,12 @@ class OptionExecutionWrapper(gym.Wrapper, RecordConstructorArgs):
             raise ResetNeeded("call reset() first: the environment was not reset, its episode ended, or it raised an error")
         play, self._play = self._play, None
 
-        obs, rewards, terminated, truncated, info = play(self.plan(option))
+        omega, n_steps = self.option_settings.decode(np.clip(option, -1.0, 1.0))
+        trajectory = action_plan(omega, n_steps)
+        slices = self._draw_slices(n_steps)
+        observe = sorted({k for ends in slices for k in ends} - {0, n_steps})
+        actions = self._primitive(trajectory)
+        obs, rewards, terminated, truncated, info = play(actions, observe) if observe else play(actions)
 
         rewards = np.asarray(rewards, dtype=np.float64)
         if not np.isfinite(rewards).all():
@@ -204,6 +273,12 @@ class OptionExecutionWrapper(gym.Wrapper, RecordConstructorArgs):
             "integrated_reward": integral,
             "discount": float(discount(duration, settings.discount_rate)),
         }
+        observations = info.pop("observations", [])
+        if self.n_sub_options:
+            last_obs = deepcopy(obs)  # which the environment may overwrite
+            seen = dict(zip(observe, observations, strict=False)) | {0: self._last_obs, len(rewards): last_obs}
+            info["sub_options"] = self._sub_options(slices, trajectory, rewards, seen, terminated, truncated)
+            self._last_obs = last_obs
         return obs, float(rewards.sum()) if self.reward == "sum" else integral, terminated, truncated, info
 
     def plan(self, option: np.ndarray) -> np.ndarray:
@@ -213,30 +288,94 @@ class OptionExecutionWrapper(gym.Wrapper, RecordConstructorArgs):
         :return: shape ``[n_steps, *action_shape]``
         """
         omega, n_steps = self.option_settings.decode(np.clip(option, -1.0, 1.0))
-        return primitive_actions(
-            action_plan(omega, n_steps), self.primitive_action_space.low, self.primitive_action_space.high
+        return self._primitive(action_plan(omega, n_steps))
+
+    def _primitive(self, trajectory: np.ndarray) -> np.ndarray:
+        return primitive_actions(trajectory, self.primitive_action_space.low, self.primitive_action_space.high)
+
+    def _draw_slices(self, n_steps: int) -> list[tuple[int, int]]:
+        """Random stretches ``(first step, step after the last)`` of an option, of at least ``d_min``, not all of it."""
+        settings = self.option_settings
+        shortest = math.ceil(settings.d_min / settings.dt - 1e-6)
+        if self.n_sub_options == 0 or n_steps <= shortest:
+            return []
+        pairs = self._slice_rng.integers(0, n_steps + 1, size=(self.n_sub_options, 2))
+        pairs.sort(axis=1)
+        lengths = pairs[:, 1] - pairs[:, 0]
+        return [(int(a), int(b)) for a, b in pairs[(lengths >= shortest) & (lengths < n_steps)]]
+
+    def _sub_options(
+        self,
+        slices: list[tuple[int, int]],
+        trajectory: np.ndarray,
+        rewards: np.ndarray,
+        observations: dict[int, Any],
+        terminated: bool,
+        truncated: bool,
+    ) -> SubOptions:
+        """Make transitions of the slices; at the episode's end they end with it, or are dropped."""
+        settings, n_ran = self.option_settings, len(rewards)
+        kept, options, residuals = [], [], []
+        for first, last in slices:
+            end = min(last, n_ran)
+            # Both are the same where the episode's end has cut off too much.
+            if (end - first) * settings.dt < settings.d_min - 1e-9:
+                continue
+            omega, residual = fit_weights(trajectory[first:end], settings.n_rbf)
+            if residual <= self.sub_option_tolerance:
+                kept.append((first, end))
+                options.append(settings.encode(omega, end - first))
+                residuals.append(residual)
+        ends = np.array(kept, dtype=np.int64).reshape(-1, 2)
+        # R of a stretch from the discounted rewards up to its ends
+        weight = step_weight(settings.dt, settings.discount_rate) if self.reward_unit == "rate" else 1.0
+        discounted = rewards * discount(np.arange(n_ran) * settings.dt, settings.discount_rate)
+        total = np.append(0.0, np.cumsum(discounted)) * weight
+        integrals = (total[ends[:, 1]] - total[ends[:, 0]]) / discount(ends[:, 0] * settings.dt, settings.discount_rate)
+        at_end = ends[:, 1] == n_ran
+        return SubOptions(
+            observations=[observations[first] for first, _ in kept],
+            next_observations=[observations[end] for _, end in kept],
+            options=np.array(options, dtype=np.float32).reshape(len(kept), *self.action_space.shape),
+            durations=(ends[:, 1] - ends[:, 0]) * settings.dt,
+            integrated_rewards=integrals,
+            terminated=at_end & terminated,
+            truncated=at_end & truncated,
+            residuals=np.array(residuals),
         )
 
-    def _step_in_a_loop(self, actions: np.ndarray) -> SequenceResult:
+    def _step_in_a_loop(self, actions: np.ndarray, observe: Sequence[int] = ()) -> SequenceResult:
         rewards: list[float] = []
+        observations = []
         step = self.env.step
-        for action in actions:
-            obs, reward, terminated, truncated, info = step(action)
-            rewards.append(reward)  # type: ignore[arg-type]
+        # In stretches between the observations that are wanted, so that a step costs nothing more.
+        for first, last in itertools.pairwise((0, *observe, len(actions))):
+            for action in actions[first:last]:
+                obs, reward, terminated, truncated, info = step(action)
+                rewards.append(reward)  # type: ignore[arg-type]
+                if terminated or truncated:
+                    break
             if terminated or truncated:
                 break
+            observations.append(deepcopy(obs))
+        if observe:
+            info["observations"] = observations
         return obs, rewards, terminated, truncated, info
 
 
-def _find_step_sequence(env: gym.Env) -> StepSequence | None:
-    """The environment's ``step_sequence``, if no wrapper above it needs to see each step."""
+def _find_step_sequence(env: gym.Env, observing: bool) -> StepSequence | None:
+    """The environment's ``step_sequence``, if no wrapper above it needs to see each step.
+
+    :param observing: whether it must be able to observe on the way
+    """
     if isinstance(env, SupportsStepSequence):
-        return env.step_sequence
+        able = not observing or "observe" in inspect.signature(env.step_sequence).parameters
+        return env.step_sequence if able else None
     # Exact types: a subclass may look at every step.
     if type(env) in (OrderEnforcing, PassiveEnvChecker):
-        return _find_step_sequence(env.env)  # type: ignore[attr-defined]
+        return _find_step_sequence(env.env, observing)  # type: ignore[attr-defined]
     if type(env) is Monitor:
-        inner = _find_step_sequence(env.env)
+        inner = _find_step_sequence(env.env, observing)
         return None if inner is None else _monitored(env, inner)
     return None
 
@@ -244,8 +383,8 @@ def _find_step_sequence(env: gym.Env) -> StepSequence | None:
 def _monitored(monitor: Monitor, play: StepSequence) -> StepSequence:
     """Keep a Monitor's books over a sequence of steps that it does not see one by one."""
 
-    def step_sequence(actions: np.ndarray) -> SequenceResult:
-        obs, rewards, terminated, truncated, info = play(actions)
+    def step_sequence(actions: np.ndarray, *observe: Sequence[int]) -> SequenceResult:
+        obs, rewards, terminated, truncated, info = play(actions, *observe)
         rewards = np.asarray(rewards, dtype=np.float64)
         monitor.rewards.extend(rewards[:-1].tolist())
         monitor.total_steps += len(rewards) - 1

@@ -10,6 +10,7 @@ from stable_baselines3.common.type_aliases import DictReplayBufferSamples, Repla
 from stable_baselines3.common.vec_env import VecNormalize
 
 from sb3_ctco.options import DEFAULT_DISCOUNT_RATE, discount
+from sb3_ctco.wrappers import SubOptions
 
 
 class _OptionStorage(ReplayBuffer):
@@ -36,7 +37,9 @@ class _OptionStorage(ReplayBuffer):
             observation_space,
             action_space,
             device,
-            n_envs=n_envs,
+            # One row a transition, whichever environment it is from: options end at different times, and the number
+            # of their sub-options differs.
+            n_envs=1,
             handle_timeout_termination=handle_timeout_termination,
         )
         self.discount_rate = float(discount_rate)
@@ -52,9 +55,10 @@ class _OptionStorage(ReplayBuffer):
         done: np.ndarray,
         infos: list[dict[str, Any]],
     ) -> None:
-        """Store one decision of each environment.
+        """Store one decision of each environment, and the sub-options that it contained.
 
-        :param infos: each with ``info["option"]`` of :class:`~sb3_ctco.wrappers.OptionExecutionWrapper`
+        :param infos: each with ``info["option"]`` of :class:`~sb3_ctco.wrappers.OptionExecutionWrapper`, and
+            ``info["sub_options"]`` if it hands over any
         :raises ValueError: if that is missing, not finite, or was discounted at another rate; nothing is stored then
         """
         try:
@@ -74,15 +78,48 @@ class _OptionStorage(ReplayBuffer):
                 f"the environment discounts an option of {durations} s by {discounts}, this buffer, at discount_rate="
                 f"{self.discount_rate}, by {discount(durations, self.discount_rate)}: give both the same discount_rate"
             )
-        position = self.pos
-        super().add(obs, next_obs, action, reward, done, infos)  # type: ignore[arg-type]
-        self.durations[position] = durations
-        self.integrated_rewards[position] = integrated_rewards
+        for i, info in enumerate(infos):
+            position, row = self.pos, slice(i, i + 1)
+            super().add(
+                _rows(obs, row),  # type: ignore[arg-type]
+                _rows(next_obs, row),  # type: ignore[arg-type]
+                action[row],
+                reward[row],
+                done[row],
+                [info],
+            )
+            self.durations[position] = durations[i]
+            self.integrated_rewards[position] = integrated_rewards[i]
+            if "sub_options" in info:
+                self._add_sub_options(info["sub_options"])
+
+    def _add_sub_options(self, sub_options: SubOptions) -> None:
+        count = len(sub_options)
+        if count == 0:
+            return
+        rows = (self.pos + np.arange(count)) % self.buffer_size
+        for stored, values in (
+            (self.observations, sub_options.observations),
+            (self.next_observations, sub_options.next_observations),
+        ):
+            if isinstance(stored, dict):
+                for key in stored:
+                    stored[key][rows, 0] = [value[key] for value in values]
+            else:
+                stored[rows, 0] = values
+        self.actions[rows, 0] = sub_options.options
+        # What primitive steps paid in sum is not kept of a sub-option; samples have R.
+        self.rewards[rows, 0] = self.integrated_rewards[rows, 0] = sub_options.integrated_rewards
+        self.durations[rows, 0] = sub_options.durations
+        self.dones[rows, 0] = sub_options.terminated | sub_options.truncated
+        self.timeouts[rows, 0] = sub_options.truncated & self.handle_timeout_termination
+        self.full = self.full or self.pos + count >= self.buffer_size
+        self.pos = (self.pos + count) % self.buffer_size
 
     def _sample_fields(self, batch_inds: np.ndarray, env: VecNormalize | None) -> dict[str, Any]:
-        # ReplayBuffer._get_samples of Stable-Baselines3 2.9 draws the environments itself, so the two further fields
-        # need it written anew; here indexing has made the copy that its to_torch would make again.
-        rows = (batch_inds, np.random.randint(0, high=self.n_envs, size=len(batch_inds)))
+        # ReplayBuffer._get_samples of Stable-Baselines3 2.9 has no place for further fields, so it is written anew;
+        # indexing has made the copy that its to_torch would make again.
+        rows = (batch_inds, np.zeros_like(batch_inds))
         dones = self.dones[rows] * (1.0 - self.timeouts[rows])
         return {
             "observations": self._observations_at(self.observations, rows, env),
@@ -103,13 +140,17 @@ class _OptionStorage(ReplayBuffer):
         return th.as_tensor(array, device=self.device)
 
 
+def _rows(obs: np.ndarray | dict[str, np.ndarray], row: slice) -> np.ndarray | dict[str, np.ndarray]:
+    return {key: value[row] for key, value in obs.items()} if isinstance(obs, dict) else obs[row]
+
+
 class OptionReplayBuffer(_OptionStorage):
     """Stable-Baselines3's ``ReplayBuffer`` for options.
 
-    Beside its fields it keeps ``durations`` (time that ran, s) and ``integrated_rewards`` (R), both
-    ``[buffer_size, n_envs]``. A sample has R as ``rewards`` and e^(−τ·duration) as ``discounts``, which SAC and TD3
-    use as they are: with this buffer and an environment wrapped in
-    :class:`~sb3_ctco.wrappers.OptionExecutionWrapper` they learn on the semi-Markov process.
+    Beside its fields it keeps ``durations`` (time that ran, s) and ``integrated_rewards`` (R). All have the shape
+    ``[buffer_size, 1, ...]`` with one row a transition, whichever environment it is from. A sample has R as ``rewards``
+    and e^(−τ·duration) as ``discounts``, which SAC and TD3 use as they are: with this buffer and an environment wrapped
+    in :class:`~sb3_ctco.wrappers.OptionExecutionWrapper` they learn on the semi-Markov process.
 
     :param discount_rate: τ, in 1/s; the wrapper's
     :raises ValueError: if ``optimize_memory_usage`` is asked for

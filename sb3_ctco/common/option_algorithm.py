@@ -1,5 +1,6 @@
 """The base of off-policy algorithms that decide by options: environments, replay buffer, time accounting."""
 
+import dataclasses
 import io
 import pathlib
 from typing import Any, TypeVar
@@ -24,12 +25,18 @@ from stable_baselines3.common.type_aliases import (
     TrainFreq,
     TrainFrequencyUnit,
 )
-from stable_baselines3.common.vec_env import VecEnv, unwrap_vec_normalize
+from stable_baselines3.common.vec_env import (
+    VecEnv,
+    VecFrameStack,
+    VecTransposeImage,
+    unwrap_vec_normalize,
+    unwrap_vec_wrapper,
+)
 
 from sb3_ctco.common.buffers import DictOptionReplayBuffer, OptionReplayBuffer
 from sb3_ctco.common.callbacks import OptionProgressBarCallback, PrimitiveStepCallback
 from sb3_ctco.options import OptionSettings, discount_rate_from_gamma
-from sb3_ctco.wrappers import OptionExecutionWrapper, find_dt
+from sb3_ctco.wrappers import OptionExecutionWrapper, SubOptions, find_dt
 
 SelfOptionOffPolicyAlgorithm = TypeVar("SelfOptionOffPolicyAlgorithm", bound="OptionOffPolicyAlgorithm")
 
@@ -54,6 +61,7 @@ class OptionOffPolicyAlgorithm(OffPolicyAlgorithm):
     :param gradient_steps: updates a training; -1 for as many as primitive steps were collected
     :param updates_per_second: updates a second of task time, the paper's "fixed number of updates per time unit",
         in place of ``gradient_steps``; a fraction is carried over
+    :param n_sub_options: how many random stretches of each option go into the replay buffer beside it
     :raises ValueError: for settings out of range or contradicting each other or the environment's
     """
 
@@ -71,6 +79,7 @@ class OptionOffPolicyAlgorithm(OffPolicyAlgorithm):
         gamma_dt: float,
         updates_per_second: float | None,
         gradient_steps: int,
+        n_sub_options: int = 0,
         verbose: int = 0,
         **kwargs: Any,
     ):
@@ -93,6 +102,8 @@ class OptionOffPolicyAlgorithm(OffPolicyAlgorithm):
             if not updates_per_second > 0:
                 raise ValueError(f"updates_per_second must be positive or None, not {updates_per_second}")
         self.updates_per_second = updates_per_second
+        self.n_sub_options = n_sub_options
+        self._residuals_since_log: list[float] = []
         #: The action space of the bare environment; None until there is an environment.
         self.primitive_action_space: spaces.Box | None = None
         self._updates_due = 0.0
@@ -128,16 +139,24 @@ class OptionOffPolicyAlgorithm(OffPolicyAlgorithm):
             n_rbf=self.n_rbf, d_max=self.d_max, d_min=self.d_min, dt=self.dt, discount_rate=self.discount_rate
         )
 
-    def wrap_env(self, env: gym.Env) -> OptionExecutionWrapper:
+    def wrap_env(self, env: gym.Env, n_sub_options: int = 0) -> OptionExecutionWrapper:
         """Wrap a bare environment as the algorithm wraps its own, for instance to evaluate in it.
 
+        :param env: the bare environment
+        :param n_sub_options: sub-options are for learning, so none by default
         :return: ``OptionExecutionWrapper(Monitor(env))``, a Monitor being added where there is none
         """
         dt = self.dt if self._dt_was_given else (find_dt(env) or self.dt)
         if unwrap_wrapper(env, Monitor) is None:
             env = Monitor(env)
         return OptionExecutionWrapper(
-            env, n_rbf=self.n_rbf, d_max=self.d_max, d_min=self.d_min, dt=dt, discount_rate=self.discount_rate
+            env,
+            n_rbf=self.n_rbf,
+            d_max=self.d_max,
+            d_min=self.d_min,
+            dt=dt,
+            discount_rate=self.discount_rate,
+            n_sub_options=n_sub_options,
         )
 
     def _as_option_env(self, env: GymEnv) -> GymEnv:
@@ -150,7 +169,7 @@ class OptionOffPolicyAlgorithm(OffPolicyAlgorithm):
             return env
         wrapped = unwrap_wrapper(env, OptionExecutionWrapper)
         if wrapped is None:
-            return self.wrap_env(env)
+            return self.wrap_env(env, self.n_sub_options)
         if unwrap_wrapper(env, Monitor) is None:
             # Inside, where it counts primitive steps; Stable-Baselines3 would put it outside.
             wrapped.env = Monitor(wrapped.env)  # type: ignore[attr-defined]
@@ -162,6 +181,17 @@ class OptionOffPolicyAlgorithm(OffPolicyAlgorithm):
         if normalizer is not None and normalizer.norm_reward:
             raise ValueError(
                 "VecNormalize counts its returns per decision, whatever time a decision takes: pass norm_reward=False"
+            )
+        for count in env.get_attr("n_sub_options"):
+            if count != self.n_sub_options:
+                raise ValueError(
+                    f"the environment hands over n_sub_options={count}, {type(self).__name__} has "
+                    f"n_sub_options={self.n_sub_options}: give both the same"
+                )
+        if self.n_sub_options and unwrap_vec_wrapper(env, VecFrameStack) is not None:
+            raise ValueError(
+                "sub-options begin at single observations, which VecFrameStack does not stack: stack frames inside, with "
+                "gymnasium.wrappers.FrameStackObservation, or pass n_sub_options=0"
             )
         settings: list[OptionSettings] = env.get_attr("option_settings")
         expected = {
@@ -300,8 +330,24 @@ class OptionOffPolicyAlgorithm(OffPolicyAlgorithm):
         dones: np.ndarray,
         infos: list[dict[str, Any]],
     ) -> None:
+        for info in infos:
+            if "sub_options" in info:
+                self._residuals_since_log.extend(info["sub_options"].residuals)
+                info["sub_options"] = self._as_stored(info["sub_options"])
         super()._store_transition(replay_buffer, buffer_action, new_obs, reward, dones, infos)
         self._durations_since_log.extend(info["option"]["duration"] for info in infos)
+
+    def _as_stored(self, sub_options: SubOptions) -> SubOptions:
+        """Sub-options come past the wrappers of the VecEnv, of which VecTransposeImage changes what is stored."""
+        assert self.env is not None
+        transpose = unwrap_vec_wrapper(self.env, VecTransposeImage)
+        if transpose is None:
+            return sub_options
+        return dataclasses.replace(
+            sub_options,
+            observations=[transpose.transpose_observations(obs) for obs in sub_options.observations],
+            next_observations=[transpose.transpose_observations(obs) for obs in sub_options.next_observations],
+        )
 
     def dump_logs(self) -> None:
         """Write log data; also the durations of options, their mean and the decision rate since the last time."""
@@ -313,6 +359,9 @@ class OptionOffPolicyAlgorithm(OffPolicyAlgorithm):
             durations = th.tensor(self._durations_since_log)
             self.logger.record("option/duration", durations, exclude=("stdout", "log", "json", "csv"))
             self._durations_since_log.clear()
+        if self._residuals_since_log:
+            self.logger.record("option/slice_residual", float(np.mean(self._residuals_since_log)))
+            self._residuals_since_log.clear()
         super().dump_logs()
 
     def predict(

@@ -101,6 +101,8 @@ class CTCO(OptionOffPolicyAlgorithm):
     :param train_freq: collect at least this many steps between trainings, or ``(n, "episode")``
     :param gradient_steps: updates a training; -1 for one a step; 1 (with ``train_freq=1``) for the paper's Algorithm 1
     :param updates_per_second: updates a second of task time, in place of ``gradient_steps``
+    :param n_sub_options: how many random stretches of each option that was played go into the replay buffer beside it,
+        as options of their own; 0 is the paper's way
     :param n_rbf: number of radial basis functions an action dimension
     :param d_max: longest duration of an option, in s
     :param d_min: shortest duration, in s; by default one step of the environment
@@ -151,6 +153,7 @@ class CTCO(OptionOffPolicyAlgorithm):
         train_freq: int | tuple[int, str] = 1,
         gradient_steps: int = -1,
         updates_per_second: float | None = None,
+        n_sub_options: int = 0,
         n_rbf: int = 3,
         d_max: float = 1.0,
         d_min: float | None = None,
@@ -186,6 +189,7 @@ class CTCO(OptionOffPolicyAlgorithm):
             gamma=gamma,
             gamma_dt=gamma_dt,
             updates_per_second=updates_per_second,
+            n_sub_options=n_sub_options,
             buffer_size=buffer_size,
             learning_starts=learning_starts,
             batch_size=batch_size,

@@ -1,8 +1,9 @@
 """Every task of dm_control's suite at any control period, as a Gymnasium environment that can play whole options."""
 
+import itertools
 import math
 import warnings
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import Any
 
 import gymnasium as gym
@@ -122,10 +123,13 @@ class DMControlEnv(gym.Env[np.ndarray, np.ndarray]):
         obs, rewards, terminated, truncated, info = self.step_sequence(np.asarray(action)[None])
         return obs, float(rewards[0]), terminated, truncated, info
 
-    def step_sequence(self, actions: np.ndarray) -> tuple[np.ndarray, np.ndarray, bool, bool, dict[str, Any]]:
+    def step_sequence(
+        self, actions: np.ndarray, observe: Sequence[int] = ()
+    ) -> tuple[np.ndarray, np.ndarray, bool, bool, dict[str, Any]]:
         """Play several actions; see :class:`~sb3_ctco.wrappers.SupportsStepSequence`.
 
         :param actions: shape ``[n_steps, action_dim]``
+        :param observe: numbers of steps after which to observe, too, increasing
         :return: last observation, the rewards of the steps that ran, terminated, truncated, info
         :raises gymnasium.error.ResetNeeded: before the first reset and after the end of an episode
         :raises dm_control.rl.control.PhysicsError: if the simulation diverges; the episode is over then
@@ -137,23 +141,29 @@ class DMControlEnv(gym.Env[np.ndarray, np.ndarray]):
         get_termination, physics, ctrl = self._task.get_termination, self._physics, data.ctrl
         steps_left, self._steps_left = self._steps_left, 0
         discount = None
-        rewards = []
+        rewards: list[float] = []
+        observations = []
         try:
             with physics.check_invalid_state():
-                for action in actions:
-                    ctrl[:] = action
-                    # dm_control's legacy step: mj_step1 at the end leaves positions and velocities in sync.
-                    if rk4:
-                        step(model, data, n_more + 1)
-                    else:
-                        step2(model, data)
-                        if n_more:
-                            step(model, data, n_more)
-                    step1(model, data)
-                    rewards.append(reward())
-                    discount = get_termination(physics)
+                for first, last in itertools.pairwise((0, *observe, len(actions))):
+                    for action in actions[first:last]:
+                        ctrl[:] = action
+                        # dm_control's legacy step: mj_step1 at the end leaves positions and velocities in sync.
+                        if rk4:
+                            step(model, data, n_more + 1)
+                        else:
+                            step2(model, data)
+                            if n_more:
+                                step(model, data, n_more)
+                        step1(model, data)
+                        rewards.append(reward())
+                        discount = get_termination(physics)
+                        if discount is not None or len(rewards) >= steps_left:
+                            break
                     if discount is not None or len(rewards) >= steps_left:
                         break
+                    if last < len(actions):
+                        observations.append(self._flat_observation())
         except PhysicsError as error:
             raise PhysicsError(f"{error} (within {len(rewards)} steps of {self.dt} s)") from error
         steps_left -= len(rewards)
@@ -161,7 +171,8 @@ class DMControlEnv(gym.Env[np.ndarray, np.ndarray]):
         truncated = not terminated and (discount is not None or steps_left < 1)
         if not (terminated or truncated):
             self._steps_left = steps_left
-        return self._flat_observation(), np.array(rewards, dtype=np.float64), terminated, truncated, {}
+        info = {"observations": observations} if observe else {}
+        return self._flat_observation(), np.array(rewards, dtype=np.float64), terminated, truncated, info
 
     def render(self) -> np.ndarray | None:  # type: ignore[override]
         """A frame, uint8 ``[height, width, 3]``, if ``render_mode`` is ``"rgb_array"``."""

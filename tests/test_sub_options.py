@@ -1,0 +1,296 @@
+"""Stretches of an option that was played, as transitions of their own."""
+
+import itertools
+import math
+
+import gymnasium as gym
+import numpy as np
+import pytest
+from stable_baselines3.common.env_util import make_vec_env
+from stable_baselines3.common.monitor import Monitor
+from stable_baselines3.common.vec_env import SubprocVecEnv, VecFrameStack
+
+from sb3_ctco import CTCO, OptionExecutionWrapper
+from sb3_ctco.options import discount, integrated_reward, step_weight
+
+TAU = math.log(2.0)
+
+
+def wrap(env, **kwargs):
+    return OptionExecutionWrapper(
+        env, **{"n_rbf": 3, "d_max": 1.5, "discount_rate": TAU, "n_sub_options": 8, "sub_option_tolerance": 2.0, **kwargs}
+    )
+
+
+def play(env, n_options=200, seed=0):
+    """Random options; yields their sub-options with the trace of the episode up to then."""
+    env.action_space.seed(seed)
+    env.reset(seed=seed)
+    for _ in range(n_options):
+        _, _, terminated, truncated, info = env.step(env.action_space.sample())
+        yield info["sub_options"], info["option"], terminated, truncated
+        if terminated or truncated:
+            env.reset()
+
+
+@pytest.mark.parametrize("end", [{"terminate_at": 23}, {"truncate_at": 23}])
+@pytest.mark.parametrize("unit", ["rate", "impulse"])
+def test_accounting_equals_running_the_stretch(scripted_env, end, unit):
+    """R, duration, observations and the end of each sub-option, from the rewards that were paid."""
+    paid = lambda step, action: math.sin(step) + float(action[0])  # noqa: E731
+    env = wrap(scripted_env(rewards=paid, **end), reward_unit=unit)
+    seen_at_end = lengths = 0
+    for sub, option, terminated, truncated in play(env):
+        base = env.unwrapped
+        start = base.count - option["n_steps"]
+        for i in range(len(sub)):
+            first, last = int(sub.observations[i][0]), int(sub.next_observations[i][0])
+            # Within the option, and no longer than it was
+            assert start <= first < last <= base.count
+            rewards = np.array([paid(k, base.actions[k]) for k in range(first, last)])
+            assert sub.durations[i] == pytest.approx((last - first) * 0.1)
+            assert sub.integrated_rewards[i] == pytest.approx(integrated_reward(rewards, 0.1, TAU, unit), abs=1e-9)
+            at_end = last == base.count
+            assert sub.terminated[i] == (terminated and at_end)
+            assert sub.truncated[i] == (truncated and at_end)
+            seen_at_end += bool(sub.terminated[i] or sub.truncated[i])
+            lengths += last - first
+            # What the option vector stands for: the duration, and the actions within the residual
+            settings = env.option_settings
+            omega, n_steps = settings.decode(sub.options[i])
+            assert n_steps == last - first
+            plan = env.plan(sub.options[i])
+            played = np.array(base.actions[first:last])
+            assert np.abs(plan - played).max() == pytest.approx(sub.residuals[i], abs=1e-6)
+            assert np.abs(omega).max() <= 1
+    assert seen_at_end > 10
+    assert lengths > 500
+
+
+def test_one_basis_function_is_exact(scripted_env):
+    env = wrap(scripted_env(truncate_at=40), n_rbf=1)
+    count = 0
+    for sub, option, _, _ in play(env):
+        np.testing.assert_allclose(sub.residuals, 0.0, atol=1e-12)
+        played = np.ravel(env.unwrapped.actions)[-option["n_steps"] :]
+        for vector in sub.options:
+            assert vector[0] == pytest.approx(played[0], abs=1e-6)
+            count += 1
+    assert count > 800
+
+
+def test_replayed_a_sub_option_lands_in_the_same_state():
+    """In a deterministic environment, from where it began, up to what its residual does."""
+    env = OptionExecutionWrapper(
+        gym.make("sb3_ctco/point_mass-easy-v0", dt=0.01), d_max=0.5, n_sub_options=8, sub_option_tolerance=0.05
+    )
+    again = OptionExecutionWrapper(gym.make("sb3_ctco/point_mass-easy-v0", dt=0.01, time_limit=1e6), d_max=0.5)
+    again.reset(seed=0)
+    errors, moved = [], []
+    for sub, *_ in itertools.islice(play(env), 40):
+        for i in range(len(sub)):
+            state = np.asarray(sub.observations[i], dtype=np.float64)
+            base = again.unwrapped
+            with base._physics.reset_context():
+                base._data.qpos[:], base._data.qvel[:] = state[:2], state[2:]
+            obs, _, _, _, info = again.step(sub.options[i])
+            assert info["option"]["duration"] == pytest.approx(sub.durations[i])
+            # A control of 1 accelerates the mass by 1/3 m/s², so one that is off by the residual for d changes the
+            # velocity by residual·d/3, and the position, d being below 1 s, by less.
+            bound = sub.residuals[i] * sub.durations[i] / 3 + 1e-5
+            np.testing.assert_allclose(obs, sub.next_observations[i], atol=bound)
+            errors.append(np.abs(obs - sub.next_observations[i]).max())
+            moved.append(np.abs(np.asarray(sub.next_observations[i]) - sub.observations[i]).max())
+    assert len(moved) > 150
+    assert np.mean(moved) > 20 * np.mean(errors)
+
+
+def test_stretches_that_fit_badly_are_left_out(scripted_env):
+    kept = {}
+    for tolerance in (0.0, 0.02, 2.0):
+        env = wrap(scripted_env(truncate_at=40), sub_option_tolerance=tolerance)
+        subs = [sub for sub, *_ in play(env)]
+        kept[tolerance] = sum(len(sub) for sub in subs)
+        assert all((sub.residuals <= tolerance).all() for sub in subs)
+    assert kept[0.0] < kept[0.02] < kept[2.0]
+
+
+def test_stretches_are_not_shorter_than_d_min(scripted_env):
+    env = wrap(scripted_env(truncate_at=37), d_min=0.3)
+    subs = [sub for sub, *_ in play(env)]
+    durations = np.concatenate([sub.durations for sub in subs])
+    assert durations.min() == pytest.approx(0.3)
+    # Nothing is shorter than an option that is as short as can be.
+    fixed = wrap(scripted_env(), d_min=0.3, d_max=0.3)
+    assert all(len(sub) == 0 for sub, *_ in itertools.islice(play(fixed), 5))
+
+
+@pytest.mark.parametrize(
+    ("kwargs", "message"), [({"n_sub_options": -1}, "n_sub_options"), ({"sub_option_tolerance": -0.1}, "tolerance")]
+)
+def test_bad_arguments(scripted_env, kwargs, message):
+    with pytest.raises(ValueError, match=message):
+        wrap(scripted_env(), **kwargs)
+
+
+def test_they_change_nothing_in_what_the_environment_does():
+    def outcome(n):
+        env = OptionExecutionWrapper(Monitor(gym.make("sb3_ctco/ball_in_cup-catch-v0", dt=0.01)), n_sub_options=n)
+        env.action_space.seed(0)
+        trace = [env.reset(seed=0)[0]]
+        for _ in range(30):
+            obs, reward, _, truncated, info = env.step(env.action_space.sample())
+            trace.append((obs, reward, info["option"]))
+            if truncated:
+                trace.append(env.reset()[0])
+        return trace
+
+    np.testing.assert_equal(outcome(0), outcome(8))
+
+
+@pytest.mark.parametrize("takes_observe", [False, True])
+def test_step_sequence_observes_on_the_way_or_gives_way_to_the_loop(scripted_env, takes_observe):
+    class Sequence(gym.Wrapper):
+        calls = 0
+
+        if takes_observe:
+
+            def step_sequence(self, actions, observe=()):
+                return self._play(actions, observe)
+        else:
+
+            def step_sequence(self, actions):
+                return self._play(actions, ())
+
+        def _play(self, actions, observe):
+            self.calls += 1
+            rewards, observations = [], []
+            for action in actions:
+                obs, reward, terminated, truncated, info = self.env.step(action)
+                rewards.append(reward)
+                if terminated or truncated:
+                    break
+                if len(rewards) in observe:
+                    observations.append(obs)
+            info["observations"] = observations
+            return obs, rewards, terminated, truncated, info
+
+    fast, slow = wrap(Monitor(Sequence(scripted_env(truncate_at=23)))), wrap(scripted_env(truncate_at=23))
+    for left, right in zip(play(fast), play(slow), strict=True):
+        np.testing.assert_equal([vars(left[0]), *left[1:]], [vars(right[0]), *right[1:]])
+    assert (fast.env.env.calls == 200) == takes_observe
+
+
+# --- in the buffer
+
+
+def make(env, policy="MlpPolicy", **kwargs):
+    return CTCO(
+        policy,
+        env,
+        **{
+            "n_sub_options": 4,
+            "learning_starts": 10**9,
+            "policy_kwargs": {"net_arch": [8]},
+            "batch_size": 8,
+            "seed": 0,
+            **kwargs,
+        },
+    )
+
+
+def test_the_buffer_holds_them_beside_the_options(random_walk_env):
+    model = make(random_walk_env()).learn(300)
+    buffer = model.replay_buffer
+    rows = slice(0, buffer.pos)
+    assert 3 * model.num_timesteps / 6 < buffer.pos
+    # Their R, discount and end in a sample, as of any other row
+    sample = buffer.sample(500)
+    np.testing.assert_allclose(
+        np.unique(sample.discounts), np.unique(discount(buffer.durations[rows], buffer.discount_rate)), rtol=1e-6
+    )
+    # Slices are not interaction.
+    assert 300 <= model.num_timesteps < 310
+    # In this environment an observation's second entry is the step within the episode, over 20.
+    first, last = buffer.observations[rows, 0, 1] * 20, buffer.next_observations[rows, 0, 1] * 20
+    np.testing.assert_allclose(last - first, buffer.durations[rows, 0] / 0.1, atol=1e-3)
+    assert (buffer.dones[rows, 0] == (last > 19.5)).all()
+    assert (buffer.timeouts[rows, 0] == buffer.dones[rows, 0]).all()
+    # The reward after a step is −|x|, so rows of one step have R ≈ −0.1·|x'|.
+    single = np.isclose(buffer.durations[rows, 0], 0.1)
+    assert single.sum() > 10
+    integrals, x = buffer.integrated_rewards[rows, 0][single], buffer.next_observations[rows, 0, 0][single]
+    np.testing.assert_allclose(integrals, -step_weight(0.1, buffer.discount_rate) * np.abs(x), rtol=1e-4, atol=1e-6)
+
+
+@pytest.mark.parametrize("kind", ["vector", "image", "dict"])
+def test_several_environments_and_other_observations(random_walk_env, kind):
+    policy = {"vector": "MlpPolicy", "image": "CnnPolicy", "dict": "MultiInputPolicy"}[kind]
+    env = make_vec_env(
+        lambda: random_walk_env(kind),
+        n_envs=2,
+        wrapper_class=OptionExecutionWrapper,
+        wrapper_kwargs={"n_sub_options": 4},
+        vec_env_cls=SubprocVecEnv if kind == "dict" else None,
+    )
+    model = make(env, policy, buffer_size=1000, learning_starts=30, gradient_steps=1).learn(100)
+    buffer = model.replay_buffer
+    rows = slice(0, buffer.pos)
+    assert buffer.pos > 60
+    if kind == "image":  # a grey value for x, the same in each pixel
+        image = buffer.observations[rows, 0]
+        assert (image == image[:, :1, :1, :1]).all()
+    if kind == "dict":
+        x = buffer.observations["vector"][rows, 0, 0]
+        np.testing.assert_allclose(buffer.observations["image"][rows, 0, 0, 0, 0], 127.5 * (x + 1), atol=1)
+    assert model._n_updates > 0
+    env.close()
+
+
+def test_images_that_sb3_transposes(random_walk_env):
+    class ChannelsLast(gym.ObservationWrapper):
+        dt = 0.1
+
+        def __init__(self, env):
+            super().__init__(env)
+            self.observation_space = gym.spaces.Box(0, 255, (36, 36, 3), np.uint8)
+
+        def observation(self, obs):
+            obs = np.moveaxis(obs, 0, -1).copy()
+            obs[..., 0] = 7
+            return obs
+
+    model = make(ChannelsLast(random_walk_env("image")), "CnnPolicy", buffer_size=500).learn(40)
+    buffer = model.replay_buffer
+    images = buffer.observations[: buffer.pos, 0]
+    assert images.shape[1:] == (3, 36, 36)
+    assert (images[:, 0] == 7).all()
+    assert buffer.pos > 20
+
+
+def test_the_ring_goes_round(random_walk_env):
+    model = make(random_walk_env(), buffer_size=50).learn(300)
+    buffer = model.replay_buffer
+    assert buffer.full
+    assert (buffer.durations > 0).all()
+
+
+def test_settings_must_agree(random_walk_env):
+    with pytest.raises(ValueError, match="n_sub_options=2"):
+        make(OptionExecutionWrapper(random_walk_env(), n_sub_options=2))
+    stacked = VecFrameStack(
+        make_vec_env(random_walk_env, wrapper_class=OptionExecutionWrapper, wrapper_kwargs={"n_sub_options": 4}), 2
+    )
+    with pytest.raises(ValueError, match="VecFrameStack"):
+        make(stacked)
+
+
+def test_the_residual_is_logged(random_walk_env):
+    model = make(random_walk_env(), d_max=1.5)
+    model.learn(0)
+    values = {}
+    dump = model.logger.dump
+    model.logger.dump = lambda step: values.update(model.logger.name_to_value) or dump(step)
+    model._custom_logger = True
+    model.learn(200)
+    assert 0 <= values["option/slice_residual"] <= 0.1
