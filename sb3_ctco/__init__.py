@@ -8,26 +8,37 @@ from sb3_ctco.envs import register_envs
 
 if TYPE_CHECKING:
     from sb3_ctco.common.buffers import DictOptionReplayBuffer, OptionReplayBuffer
+    from sb3_ctco.common.sac_at_rate import sac_at_rate
     from sb3_ctco.controller import OptionController
     from sb3_ctco.ctco import CTCO
-    from sb3_ctco.wrappers import OptionExecutionWrapper
+    from sb3_ctco.dac_ppo import DACPPO
+    from sb3_ctco.figar_sac import FiGARSAC
+    from sb3_ctco.wrappers import OptionExecutionWrapper, RewardRateWrapper
 
 __all__ = [
     "CTCO",
+    "DACPPO",
     "DictOptionReplayBuffer",
+    "FiGARSAC",
     "OptionController",
     "OptionExecutionWrapper",
     "OptionReplayBuffer",
+    "RewardRateWrapper",
     "__version__",
+    "sac_at_rate",
 ]
 
 # Imported when first used, so that a control loop that runs an exported policy does not load PyTorch.
 _HOMES = {
     "CTCO": "sb3_ctco.ctco",
+    "DACPPO": "sb3_ctco.dac_ppo",
     "DictOptionReplayBuffer": "sb3_ctco.common.buffers",
+    "FiGARSAC": "sb3_ctco.figar_sac",
     "OptionController": "sb3_ctco.controller",
     "OptionExecutionWrapper": "sb3_ctco.wrappers",
     "OptionReplayBuffer": "sb3_ctco.common.buffers",
+    "RewardRateWrapper": "sb3_ctco.wrappers",
+    "sac_at_rate": "sb3_ctco.common.sac_at_rate",
 }
 
 

@@ -32,10 +32,11 @@ from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_ctco.common.option_algorithm import OptionOffPolicyAlgorithm
 from sb3_ctco.ctco import CTCO
-from sb3_ctco.options import discount_rate_from_gamma
+from sb3_ctco.dac_ppo import DACPPO
+from sb3_ctco.figar_sac import FiGARSAC
 
 #: The package's algorithms by their names in the Zoo.
-ALGORITHMS: dict[str, type[BaseAlgorithm]] = {"ctco": CTCO}
+ALGORITHMS: dict[str, type[BaseAlgorithm]] = {"ctco": CTCO, "dac_ppo": DACPPO, "figar_sac": FiGARSAC}
 
 WRAPPER = "sb3_ctco.wrappers.OptionExecutionWrapper"
 
@@ -121,11 +122,10 @@ class OptionExperimentManager(ExperimentManager):
         wrappers = list(given) if isinstance(given, list) else [given]
         if any(WRAPPER in (wrapper if isinstance(wrapper, dict) else [wrapper]) for wrapper in wrappers):
             return wrappers
-        parameters = inspect.signature(ALGOS[self.algo]).parameters
-        names = ("n_rbf", "d_max", "d_min", "dt", "gamma", "gamma_dt", "n_sub_options")
-        kwargs = {name: hyperparams.get(name, parameters[name].default) for name in names}
-        kwargs["discount_rate"] = discount_rate_from_gamma(kwargs.pop("gamma"), kwargs.pop("gamma_dt"))
-        return [*wrappers, {WRAPPER: kwargs}]
+        algorithm = ALGOS[self.algo]
+        parameters = inspect.signature(algorithm).parameters
+        arguments = {name: hyperparams.get(name, parameter.default) for name, parameter in parameters.items()}
+        return [*wrappers, {WRAPPER: algorithm.wrapper_kwargs(arguments)}]
 
 
 def register() -> None:

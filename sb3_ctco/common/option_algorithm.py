@@ -139,6 +139,16 @@ class OptionOffPolicyAlgorithm(OffPolicyAlgorithm):
             n_rbf=self.n_rbf, d_max=self.d_max, d_min=self.d_min, dt=self.dt, discount_rate=self.discount_rate
         )
 
+    @classmethod
+    def wrapper_kwargs(cls, arguments: dict[str, Any]) -> dict[str, Any]:
+        """OptionExecutionWrapper's arguments for the algorithm's, where environments are made before it.
+
+        :param arguments: the algorithm's arguments, defaults included
+        """
+        kwargs = {name: arguments[name] for name in ("n_rbf", "d_max", "d_min", "dt")}
+        kwargs["n_sub_options"] = arguments.get("n_sub_options", 0)
+        return {**kwargs, "discount_rate": discount_rate_from_gamma(arguments["gamma"], arguments["gamma_dt"])}
+
     def wrap_env(self, env: gym.Env, n_sub_options: int = 0) -> OptionExecutionWrapper:
         """Wrap a bare environment as the algorithm wraps its own, for instance to evaluate in it.
 

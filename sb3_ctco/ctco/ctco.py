@@ -7,46 +7,18 @@ import torch as th
 from stable_baselines3.common.buffers import ReplayBuffer
 from stable_baselines3.common.noise import ActionNoise
 from stable_baselines3.common.policies import BasePolicy
-from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, Schedule
-from stable_baselines3.common.utils import FloatSchedule, get_parameters_by_name, polyak_update
+from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, PyTorchObs, ReplayBufferSamples, Schedule
+from stable_baselines3.common.utils import FloatSchedule
+from torch import nn
 
-from sb3_ctco.common.option_algorithm import OptionOffPolicyAlgorithm
+from sb3_ctco.common.soft_actor_critic import SoftOptionActorCritic, critic_loss, critic_target
 from sb3_ctco.ctco.policies import CnnPolicy, CTCOPolicy, MlpPolicy, MultiInputPolicy, OptionActor, OptionCritic
+
+__all__ = ["CTCO", "actor_loss", "critic_loss", "critic_target", "log_reference_density"]
 
 SelfCTCO = TypeVar("SelfCTCO", bound="CTCO")
 
 EntropyReference = Literal["uniform", "paper"]
-
-
-def critic_target(
-    integrated_rewards: th.Tensor,
-    dones: th.Tensor,
-    discounts: th.Tensor,
-    next_q_values: th.Tensor,
-    next_entropy_costs: th.Tensor,
-    high_freq_penalty: float,
-) -> th.Tensor:
-    """``R − β_h + γ(d)·(Q̂_χ'(s', ω', d') − β_E log π(ω', d'|s'))``, the target in the paper's L_Q (after equation (6)).
-
-    All tensors are ``[batch, 1]``.
-
-    :param integrated_rewards: R
-    :param dones: 1 where the episode terminated (not where it was truncated)
-    :param discounts: γ(d) = e^(−τ·duration)
-    :param next_q_values: smallest target Q-value of an option of the target policy
-    :param next_entropy_costs: β_E log π of that option
-    :param high_freq_penalty: β_h
-    """
-    return integrated_rewards - high_freq_penalty + (1.0 - dones) * discounts * (next_q_values - next_entropy_costs)
-
-
-def critic_loss(q_values: th.Tensor, targets: th.Tensor) -> th.Tensor:
-    """L_Q of the paper, as Stable-Baselines3's SAC scales it: half the mean square error, summed over critics.
-
-    :param q_values: ``[n_critics, batch, 1]``
-    :param targets: ``[batch, 1]``
-    """
-    return 0.5 * (q_values - targets).square().mean(dim=(1, 2)).sum()
 
 
 def actor_loss(q_values: th.Tensor, entropy_costs: th.Tensor) -> th.Tensor:
@@ -72,7 +44,7 @@ def log_reference_density(omega_dim: int, d_min: float, d_max: float, reference:
     return th.tensor([0.0, math.log((d_max - d_min) / 2.0) if d_max > d_min else 0.0])
 
 
-class CTCO(OptionOffPolicyAlgorithm):
+class CTCO(SoftOptionActorCritic):
     """Continuous-Time Continuous-Options (CTCO).
 
     The policy picks an option: the weights ω of a smooth open-loop trajectory of actions, and the time d to play it.
@@ -196,6 +168,10 @@ class CTCO(OptionOffPolicyAlgorithm):
             tau=tau,
             train_freq=train_freq,
             gradient_steps=gradient_steps,
+            ent_coef=ent_coef,
+            duration_ent_coef=duration_ent_coef,
+            target_entropy=target_entropy,
+            duration_target_entropy=duration_target_entropy,
             action_noise=action_noise,
             replay_buffer_class=replay_buffer_class,
             replay_buffer_kwargs=replay_buffer_kwargs,
@@ -207,10 +183,6 @@ class CTCO(OptionOffPolicyAlgorithm):
             device=device,
         )
         self.high_freq_penalty = high_freq_penalty
-        self.ent_coef = ent_coef
-        self.duration_ent_coef = duration_ent_coef
-        self.target_entropy = target_entropy
-        self.duration_target_entropy = duration_target_entropy
         self.duration_learning_rate = duration_learning_rate
         self.entropy_reference: EntropyReference = entropy_reference
 
@@ -219,50 +191,23 @@ class CTCO(OptionOffPolicyAlgorithm):
 
     def _setup_model(self) -> None:
         super()._setup_model()
-        self._create_aliases()
         self._duration_lr_schedule = (
             self.lr_schedule if self.duration_learning_rate is None else FloatSchedule(self.duration_learning_rate)
         )
-        self._source_parameters: list[th.Tensor] = [*self.critic.parameters(), *self.actor.parameters()]
-        self._target_parameters: list[th.Tensor] = [*self.critic_target.parameters(), *self.actor_target.parameters()]
-        # Running statistics of batch normalisation are no parameters, so they are copied to the targets.
-        self._batch_norm_stats = get_parameters_by_name(self.critic, ["running_"])
-        self._batch_norm_stats += get_parameters_by_name(self.actor, ["running_"])
-        self._batch_norm_stats_target = get_parameters_by_name(self.critic_target, ["running_"])
-        self._batch_norm_stats_target += get_parameters_by_name(self.actor_target, ["running_"])
-
-        if self.target_entropy == "auto":
-            self.target_entropy = float(-self.actor.omega_dim)
-        if self.duration_target_entropy == "auto":
-            self.duration_target_entropy = -1.0
-        self._setup_temperatures()
-
-    def _setup_temperatures(self) -> None:
-        """Both temperatures and all that belongs to them as vectors ``[2]``, for ω and for d."""
-        omega_coef, omega_learned = _parse_ent_coef("ent_coef", self.ent_coef)
-        duration_coef, duration_learned = _parse_ent_coef("duration_ent_coef", self.duration_ent_coef)
-        d_min = self.d_min
-        assert d_min is not None
-        if d_min == self.d_max:
-            # A duration that is fixed has no entropy to be paid for.
-            duration_coef, duration_learned = 0.0, False
-        self._ent_coef_learned = th.tensor([omega_learned, duration_learned], device=self.device)
-        self._target_entropies = th.tensor(
-            [float(self.target_entropy), float(self.duration_target_entropy)], device=self.device
-        )
-        self._log_reference = log_reference_density(self.actor.omega_dim, d_min, self.d_max, self.entropy_reference).to(
+        assert self.d_min is not None
+        self._log_reference = log_reference_density(self.actor.omega_dim, self.d_min, self.d_max, self.entropy_reference).to(
             self.device
         )
-        self.log_ent_coefs = th.tensor([omega_coef, duration_coef], device=self.device).log().requires_grad_(True)
-        self.ent_coef_optimizer: th.optim.Adam | None = None
-        if omega_learned or duration_learned:
-            self.ent_coef_optimizer = th.optim.Adam([self.log_ent_coefs], lr=self.lr_schedule(1), fused=True)
+
+    def _networks_and_targets(self) -> list[tuple[nn.Module, nn.Module]]:
+        return [*super()._networks_and_targets(), (self.actor, self.actor_target)]
 
     def _create_aliases(self) -> None:
-        self.actor = self.policy.actor
+        super()._create_aliases()
         self.actor_target = self.policy.actor_target
-        self.critic = self.policy.critic
-        self.critic_target = self.policy.critic_target
+
+    def _auto_target_entropies(self) -> tuple[float, float]:
+        return float(-self.actor.omega_dim), -1.0
 
     def _update_learning_rate(self, optimizers: list[th.optim.Optimizer] | th.optim.Optimizer) -> None:
         super()._update_learning_rate(optimizers)
@@ -274,7 +219,27 @@ class CTCO(OptionOffPolicyAlgorithm):
         :param log_prob: log π(ω|s) and log π(d|s), ``[batch, 2]``
         :return: ``[batch, 1]``
         """
-        return ((log_prob - self._log_reference) @ self.log_ent_coefs.detach().exp())[:, None]
+        return ((log_prob - self._log_reference) @ self.ent_coefs)[:, None]
+
+    def _sample_policy(self, obs: PyTorchObs) -> tuple[th.Tensor, ...]:
+        return self.actor.option_log_prob(obs)
+
+    def _critic_targets(self, data: ReplayBufferSamples) -> th.Tensor:
+        assert data.discounts is not None
+        next_options, next_log_prob = self.actor_target.option_log_prob(data.next_observations)
+        next_q_values = self.critic_target(data.next_observations, next_options).amin(dim=0)
+        return critic_target(
+            data.rewards,
+            data.dones,
+            data.discounts,
+            next_q_values,
+            self.entropy_costs(next_log_prob),
+            self._current_high_freq_penalty(),
+        )
+
+    def _actor_loss(self, obs: PyTorchObs, sample: tuple[th.Tensor, ...]) -> th.Tensor:
+        options, log_prob = sample
+        return actor_loss(self.critic(obs, options), self.entropy_costs(log_prob))
 
     def train(self, gradient_steps: int, batch_size: int = 64) -> None:
         """Sample the replay buffer and update temperatures, critics, actor and targets.
@@ -282,79 +247,12 @@ class CTCO(OptionOffPolicyAlgorithm):
         :param gradient_steps: number of updates
         :param batch_size: decisions in a minibatch
         """
-        assert self.replay_buffer is not None
-        self.policy.set_training_mode(True)
-        optimizers = [self.actor.optimizer, self.critic.optimizer]
-        if self.ent_coef_optimizer is not None:
-            optimizers.append(self.ent_coef_optimizer)
-        self._update_learning_rate(optimizers)
+        super().train(gradient_steps, batch_size)
+        self.logger.record("option/high_freq_penalty", self._current_high_freq_penalty())
+
+    def _current_high_freq_penalty(self) -> float:
         # Read anew, so that it can be changed between trainings.
-        high_freq_penalty = FloatSchedule(self.high_freq_penalty)(self._current_progress_remaining)
-
-        actor_parameters = list(self.actor.parameters())
-        losses = []
-        for _ in range(gradient_steps):
-            data = self.replay_buffer.sample(batch_size, env=self._vec_normalize_env)
-            assert data.discounts is not None
-
-            options, log_prob = self.actor.option_log_prob(data.observations)
-            ent_coef_loss = self._update_temperatures(log_prob.detach())
-
-            with th.no_grad():
-                next_options, next_log_prob = self.actor_target.option_log_prob(data.next_observations)
-                next_q_values = self.critic_target(data.next_observations, next_options).amin(dim=0)
-                targets = critic_target(
-                    data.rewards,
-                    data.dones,
-                    data.discounts,
-                    next_q_values,
-                    self.entropy_costs(next_log_prob),
-                    high_freq_penalty,
-                )
-            q_loss = critic_loss(self.critic(data.observations, data.actions), targets)
-            self.critic.optimizer.zero_grad()
-            q_loss.backward()
-            self.critic.optimizer.step()
-
-            pi_loss = actor_loss(self.critic(data.observations, options), self.entropy_costs(log_prob))
-            self.actor.optimizer.zero_grad()
-            pi_loss.backward(inputs=actor_parameters)  # and no gradients for the critics
-            self.actor.optimizer.step()
-
-            with th.no_grad():
-                # Stable-Baselines3's polyak_update of all parameters in one call
-                th._foreach_lerp_(self._target_parameters, self._source_parameters, self.tau)
-            polyak_update(self._batch_norm_stats, self._batch_norm_stats_target, 1.0)
-            losses.append(th.stack((pi_loss.detach(), q_loss.detach(), ent_coef_loss)))
-
-        self._n_updates += gradient_steps
-        # Read once, because each reading waits for the device.
-        pi_loss_mean, q_loss_mean, ent_coef_loss_mean = th.stack(losses).mean(dim=0).tolist()
-        ent_coef, duration_ent_coef = self.log_ent_coefs.detach().exp().tolist()
-        self.logger.record("train/n_updates", self._n_updates, exclude="tensorboard")
-        self.logger.record("train/ent_coef", ent_coef)
-        self.logger.record("train/duration_ent_coef", duration_ent_coef)
-        self.logger.record("train/actor_loss", pi_loss_mean)
-        self.logger.record("train/critic_loss", q_loss_mean)
-        if self.ent_coef_optimizer is not None:
-            self.logger.record("train/ent_coef_loss", ent_coef_loss_mean)
-        self.logger.record("option/high_freq_penalty", high_freq_penalty)
-
-    def _update_temperatures(self, log_prob: th.Tensor) -> th.Tensor:
-        """SAC's dual ascent on the temperatures of ω and d; those that are fixed get no gradient.
-
-        :param log_prob: ``[batch, 2]``, over the normalised box
-        :return: the loss
-        """
-        if self.ent_coef_optimizer is None:
-            return th.zeros((), device=self.device)
-        excess = th.where(self._ent_coef_learned, log_prob.mean(dim=0) + self._target_entropies, 0.0)
-        # A temperature of zero is fixed and has no finite logarithm.
-        loss = -(th.where(self._ent_coef_learned, self.log_ent_coefs.detach(), 0.0) * excess).sum()
-        # The loss is linear in the logarithms, so its gradient needs no backward pass.
-        self.log_ent_coefs.grad = -excess
-        self.ent_coef_optimizer.step()
-        return loss
+        return FloatSchedule(self.high_freq_penalty)(self._current_progress_remaining)
 
     def learn(
         self: SelfCTCO,
@@ -379,35 +277,4 @@ class CTCO(OptionOffPolicyAlgorithm):
         )
 
     def _excluded_save_params(self) -> list[str]:
-        aliases = ["actor", "actor_target", "critic", "critic_target"]
-        derived = [
-            "_source_parameters",
-            "_target_parameters",
-            "_batch_norm_stats",
-            "_batch_norm_stats_target",
-            "_ent_coef_learned",
-            "_target_entropies",
-            "_log_reference",
-        ]
-        return super()._excluded_save_params() + aliases + derived
-
-    def _get_torch_save_params(self) -> tuple[list[str], list[str]]:
-        state_dicts = ["policy", "actor.optimizer", "critic.optimizer"]
-        if self.ent_coef_optimizer is not None:
-            state_dicts.append("ent_coef_optimizer")
-        return state_dicts, ["log_ent_coefs"]
-
-
-def _parse_ent_coef(name: str, value: str | float) -> tuple[float, bool]:
-    """A temperature's initial value, and whether it is learned.
-
-    :raises ValueError: if ``value`` is neither a number that is at least 0, nor "auto", nor "auto_<positive number>"
-    """
-    learned = isinstance(value, str) and (value == "auto" or value.startswith("auto_"))
-    try:
-        initial = float(value.removeprefix("auto").removeprefix("_") or 1.0) if learned else float(value)  # type: ignore
-    except ValueError:
-        initial = -1.0
-    if initial < 0 or (learned and initial == 0) or not math.isfinite(initial):
-        raise ValueError(f"{name} must be a number of at least 0, 'auto', or 'auto_<positive number>', not {value!r}")
-    return initial, learned
+        return [*super()._excluded_save_params(), "actor_target", "_log_reference"]

@@ -1,0 +1,255 @@
+"""Soft actor-critic on options: what CTCO and FiGAR-SAC share, their losses and the loop of updates."""
+
+import math
+from typing import Any
+
+import torch as th
+from stable_baselines3.common.type_aliases import GymEnv, PyTorchObs, ReplayBufferSamples, Schedule
+from stable_baselines3.common.utils import get_parameters_by_name, polyak_update
+from torch import nn
+
+from sb3_ctco.common.option_algorithm import OptionOffPolicyAlgorithm
+from sb3_ctco.common.policies import EnsembleCritic, SoftOptionPolicy, SquashedActor
+
+
+def critic_target(
+    integrated_rewards: th.Tensor,
+    dones: th.Tensor,
+    discounts: th.Tensor,
+    next_q_values: th.Tensor,
+    next_entropy_costs: th.Tensor,
+    high_freq_penalty: float = 0.0,
+) -> th.Tensor:
+    """``R − β_h + γ(d)·(Q̂_χ'(s', ω', d') − β_E log π(ω', d'|s'))``, the target in CTCO's L_Q (after equation (6)).
+
+    All tensors are ``[batch, 1]``.
+
+    :param integrated_rewards: R
+    :param dones: 1 where the episode terminated (not where it was truncated)
+    :param discounts: γ(d) = e^(−τ·duration)
+    :param next_q_values: smallest target Q-value of an option of the target policy
+    :param next_entropy_costs: β_E log π of that option
+    :param high_freq_penalty: β_h
+    """
+    return integrated_rewards - high_freq_penalty + (1.0 - dones) * discounts * (next_q_values - next_entropy_costs)
+
+
+def critic_loss(q_values: th.Tensor, targets: th.Tensor) -> th.Tensor:
+    """L_Q of CTCO's paper, as Stable-Baselines3's SAC scales it: half the mean square error, summed over critics.
+
+    :param q_values: ``[n_critics, batch, 1]``
+    :param targets: ``[batch, 1]``
+    """
+    return 0.5 * (q_values - targets).square().mean(dim=(1, 2)).sum()
+
+
+class SoftOptionActorCritic(OptionOffPolicyAlgorithm):
+    """Soft actor-critic whose options have two parts: what to do, and for how long.
+
+    Each part has a temperature of its own. Subclasses say how the policy is sampled, what the critics learn, and how
+    the actor is judged: ``_sample_policy``, ``_q_values``, ``_critic_targets``, ``_actor_loss`` and
+    ``_auto_target_entropies``.
+
+    Parameters that :class:`~sb3_ctco.common.option_algorithm.OptionOffPolicyAlgorithm` has are documented there:
+
+    :param ent_coef: temperature of what to do: a number, ``"auto"`` to learn it, or ``"auto_0.1"`` to start at 0.1
+    :param duration_ent_coef: temperature of the duration, likewise
+    :param target_entropy: entropy that a learned temperature keeps, or ``"auto"``
+    :param duration_target_entropy: likewise for the duration
+    """
+
+    policy: SoftOptionPolicy
+    actor: SquashedActor
+    critic: EnsembleCritic
+    critic_target: EnsembleCritic
+
+    def __init__(
+        self,
+        policy: str | type[SoftOptionPolicy],
+        env: GymEnv | str | None,
+        learning_rate: float | Schedule,
+        *,
+        ent_coef: str | float,
+        duration_ent_coef: str | float,
+        target_entropy: str | float,
+        duration_target_entropy: str | float,
+        **kwargs: Any,
+    ):
+        super().__init__(policy, env, learning_rate, **kwargs)
+        self.ent_coef = ent_coef
+        self.duration_ent_coef = duration_ent_coef
+        self.target_entropy = target_entropy
+        self.duration_target_entropy = duration_target_entropy
+
+    def _setup_model(self) -> None:
+        super()._setup_model()
+        self._create_aliases()
+        self._source_parameters: list[th.Tensor] = []
+        self._target_parameters: list[th.Tensor] = []
+        # Running statistics of batch normalisation are no parameters, so they are copied to the targets.
+        self._batch_norm_stats: list[th.Tensor] = []
+        self._batch_norm_stats_target: list[th.Tensor] = []
+        for network, target in self._networks_and_targets():
+            self._source_parameters += network.parameters()
+            self._target_parameters += target.parameters()
+            self._batch_norm_stats += get_parameters_by_name(network, ["running_"])
+            self._batch_norm_stats_target += get_parameters_by_name(target, ["running_"])
+        self._setup_temperatures()
+
+    def _networks_and_targets(self) -> list[tuple[nn.Module, nn.Module]]:
+        """The networks that a target follows, each with it."""
+        return [(self.critic, self.critic_target)]
+
+    def _create_aliases(self) -> None:
+        self.actor = self.policy.actor  # type: ignore[assignment]
+        self.critic = self.policy.critic  # type: ignore[assignment]
+        self.critic_target = self.policy.critic_target  # type: ignore[assignment]
+
+    def _auto_target_entropies(self) -> tuple[float, float]:
+        """What ``"auto"`` stands for: the target entropies of what to do, and of the duration."""
+        raise NotImplementedError
+
+    def _setup_temperatures(self) -> None:
+        """Both temperatures and all that belongs to them as vectors ``[2]``: what to do, and the duration."""
+        auto_target, auto_duration_target = self._auto_target_entropies()
+        if self.target_entropy == "auto":
+            self.target_entropy = auto_target
+        if self.duration_target_entropy == "auto":
+            self.duration_target_entropy = auto_duration_target
+        coef, learned = _parse_ent_coef("ent_coef", self.ent_coef)
+        duration_coef, duration_learned = _parse_ent_coef("duration_ent_coef", self.duration_ent_coef)
+        if self.d_min == self.d_max:
+            # A duration that is fixed has no entropy to be paid for.
+            duration_coef, duration_learned = 0.0, False
+        self._ent_coef_learned = th.tensor([learned, duration_learned], device=self.device)
+        self._target_entropies = th.tensor(
+            [float(self.target_entropy), float(self.duration_target_entropy)], device=self.device
+        )
+        self.log_ent_coefs = th.tensor([coef, duration_coef], device=self.device).log().requires_grad_(True)
+        self.ent_coef_optimizer: th.optim.Adam | None = None
+        if learned or duration_learned:
+            self.ent_coef_optimizer = th.optim.Adam([self.log_ent_coefs], lr=self.lr_schedule(1), fused=True)
+
+    def _sample_policy(self, obs: PyTorchObs) -> tuple[th.Tensor, ...]:
+        """Sample the policy, reparameterised.
+
+        :return: what to do, and log π of both parts as the columns of ``[batch, 2]``; more, if a subclass needs it
+        """
+        raise NotImplementedError
+
+    def _critic_targets(self, data: ReplayBufferSamples) -> th.Tensor:
+        """What the critics learn, ``[batch, 1]``; called without gradients."""
+        raise NotImplementedError
+
+    def _q_values(self, data: ReplayBufferSamples) -> th.Tensor:
+        """The critics' values of the stored options, ``[n_critics, batch, 1]``."""
+        return self.critic(data.observations, data.actions)
+
+    def _actor_loss(self, obs: PyTorchObs, sample: tuple[th.Tensor, ...]) -> th.Tensor:
+        """The actor's loss, of what ``_sample_policy`` returned."""
+        raise NotImplementedError
+
+    def train(self, gradient_steps: int, batch_size: int = 64) -> None:
+        """Sample the replay buffer and update temperatures, critics, actor and targets.
+
+        :param gradient_steps: number of updates
+        :param batch_size: decisions in a minibatch
+        """
+        assert self.replay_buffer is not None
+        self.policy.set_training_mode(True)
+        optimizers = [self.actor.optimizer, self.critic.optimizer]
+        if self.ent_coef_optimizer is not None:
+            optimizers.append(self.ent_coef_optimizer)
+        self._update_learning_rate(optimizers)
+
+        actor_parameters = list(self.actor.parameters())
+        losses = []
+        for _ in range(gradient_steps):
+            data = self.replay_buffer.sample(batch_size, env=self._vec_normalize_env)
+
+            sample = self._sample_policy(data.observations)
+            ent_coef_loss = self._update_temperatures(sample[1].detach())
+
+            with th.no_grad():
+                targets = self._critic_targets(data)
+            q_loss = critic_loss(self._q_values(data), targets)
+            self.critic.optimizer.zero_grad()
+            q_loss.backward()
+            self.critic.optimizer.step()
+
+            pi_loss = self._actor_loss(data.observations, sample)
+            self.actor.optimizer.zero_grad()
+            pi_loss.backward(inputs=actor_parameters)  # and no gradients for the critics
+            self.actor.optimizer.step()
+
+            with th.no_grad():
+                # Stable-Baselines3's polyak_update of all parameters in one call
+                th._foreach_lerp_(self._target_parameters, self._source_parameters, self.tau)
+            polyak_update(self._batch_norm_stats, self._batch_norm_stats_target, 1.0)
+            losses.append(th.stack((pi_loss.detach(), q_loss.detach(), ent_coef_loss)))
+
+        self._n_updates += gradient_steps
+        # Read once, because each reading waits for the device.
+        pi_loss_mean, q_loss_mean, ent_coef_loss_mean = th.stack(losses).mean(dim=0).tolist()
+        ent_coef, duration_ent_coef = self.ent_coefs.tolist()
+        self.logger.record("train/n_updates", self._n_updates, exclude="tensorboard")
+        self.logger.record("train/ent_coef", ent_coef)
+        self.logger.record("train/duration_ent_coef", duration_ent_coef)
+        self.logger.record("train/actor_loss", pi_loss_mean)
+        self.logger.record("train/critic_loss", q_loss_mean)
+        if self.ent_coef_optimizer is not None:
+            self.logger.record("train/ent_coef_loss", ent_coef_loss_mean)
+
+    @property
+    def ent_coefs(self) -> th.Tensor:
+        """Both temperatures, of what to do and of the duration, ``[2]``, without gradients."""
+        return self.log_ent_coefs.detach().exp()
+
+    def _update_temperatures(self, log_prob: th.Tensor) -> th.Tensor:
+        """SAC's dual ascent on both temperatures; those that are fixed get no gradient.
+
+        :param log_prob: ``[batch, 2]``, over the normalised box
+        :return: the loss
+        """
+        if self.ent_coef_optimizer is None:
+            return th.zeros((), device=self.device)
+        excess = th.where(self._ent_coef_learned, log_prob.mean(dim=0) + self._target_entropies, 0.0)
+        # A temperature of zero is fixed and has no finite logarithm.
+        loss = -(th.where(self._ent_coef_learned, self.log_ent_coefs.detach(), 0.0) * excess).sum()
+        # The loss is linear in the logarithms, so its gradient needs no backward pass.
+        self.log_ent_coefs.grad = -excess
+        self.ent_coef_optimizer.step()
+        return loss
+
+    def _excluded_save_params(self) -> list[str]:
+        aliases = ["actor", "critic", "critic_target"]
+        derived = [
+            "_source_parameters",
+            "_target_parameters",
+            "_batch_norm_stats",
+            "_batch_norm_stats_target",
+            "_ent_coef_learned",
+            "_target_entropies",
+        ]
+        return super()._excluded_save_params() + aliases + derived
+
+    def _get_torch_save_params(self) -> tuple[list[str], list[str]]:
+        state_dicts = ["policy", "actor.optimizer", "critic.optimizer"]
+        if self.ent_coef_optimizer is not None:
+            state_dicts.append("ent_coef_optimizer")
+        return state_dicts, ["log_ent_coefs"]
+
+
+def _parse_ent_coef(name: str, value: str | float) -> tuple[float, bool]:
+    """A temperature's initial value, and whether it is learned.
+
+    :raises ValueError: if ``value`` is neither a number that is at least 0, nor "auto", nor "auto_<positive number>"
+    """
+    learned = isinstance(value, str) and (value == "auto" or value.startswith("auto_"))
+    try:
+        initial = float(value.removeprefix("auto").removeprefix("_") or 1.0) if learned else float(value)  # type: ignore
+    except ValueError:
+        initial = -1.0
+    if initial < 0 or (learned and initial == 0) or not math.isfinite(initial):
+        raise ValueError(f"{name} must be a number of at least 0, 'auto', or 'auto_<positive number>', not {value!r}")
+    return initial, learned

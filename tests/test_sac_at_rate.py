@@ -1,0 +1,204 @@
+import doctest
+import math
+
+import gymnasium as gym
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from stable_baselines3 import SAC
+from stable_baselines3.common.env_util import make_vec_env
+from stable_baselines3.common.monitor import Monitor
+
+from sb3_ctco import OptionExecutionWrapper, RewardRateWrapper, sac_at_rate
+from sb3_ctco.common import sac_at_rate as module
+from sb3_ctco.common.evaluation import DiscountedReturnCallback, evaluate_discounted_return
+from sb3_ctco.common.sac_at_rate import update_schedule
+from sb3_ctco.options import DEFAULT_DISCOUNT_RATE
+from sb3_ctco.wrappers import reward_rate
+
+SMALL = {"policy_kwargs": {"net_arch": [8]}, "batch_size": 8, "device": "cpu", "seed": 0}
+
+
+# --- the wrapper
+
+
+def test_reward_rate_by_hand(scripted_env):
+    """τ = ln 2 per second and steps of 1 s: a rate of r is worth r·(1 − ½)/ln 2."""
+    env = RewardRateWrapper(scripted_env(rewards=lambda step, action: 3.0 + step), dt=1.0, discount_rate=math.log(2.0))
+    env.reset()
+    for rate in (3.0, 4.0):
+        _, reward, _, _, info = env.step(np.zeros(1))
+        assert reward == pytest.approx(rate * 0.5 / math.log(2.0))
+        assert info["option"] == {
+            "duration": 1.0,
+            "n_steps": 1,
+            "integrated_reward": reward,
+            "discount": pytest.approx(0.5),
+        }
+        assert info["count"] == rate - 2
+
+
+def test_without_discounting_a_rate_is_worth_its_time(scripted_env):
+    env = RewardRateWrapper(scripted_env(dt=0.02), discount_rate=0.0)
+    env.reset()
+    assert env.step(np.zeros(1))[1] == pytest.approx(0.02)
+
+
+@given(st.floats(0.001, 1.0), st.floats(0.0, 5.0), st.integers(1, 20))
+def test_a_step_is_an_option_of_one_step(dt, discount_rate, n_steps):
+    """The discounted return of n steps is the R of the option that is made of them."""
+    from conftest import ScriptedEnv
+
+    make_env = lambda: ScriptedEnv(rewards=lambda step, action: math.cos(step), dt=dt)  # noqa: E731
+    env = RewardRateWrapper(make_env(), discount_rate=discount_rate)
+    env.reset()
+    total, discounts = 0.0, 1.0
+    for _ in range(n_steps):
+        _, reward, _, _, info = env.step(np.zeros(1))
+        total += discounts * reward
+        discounts *= info["option"]["discount"]
+    d = n_steps * dt
+    option_env = OptionExecutionWrapper(make_env(), n_rbf=1, d_min=d, d_max=d, discount_rate=discount_rate)
+    option_env.reset()
+    option = option_env.step(np.zeros(2))[4]["option"]
+    assert option["n_steps"] == n_steps
+    assert total == pytest.approx(option["integrated_reward"], rel=1e-9, abs=1e-9)
+    assert discounts == pytest.approx(option["discount"])
+
+
+def test_bad_wrapper_settings(scripted_env):
+    with pytest.raises(ValueError, match="pass dt, in seconds, to RewardRateWrapper"):
+        RewardRateWrapper(scripted_env(dt=None))
+    with pytest.raises(ValueError, match="dt must be a positive"):
+        RewardRateWrapper(scripted_env(), dt=0.0)
+    with pytest.raises(ValueError, match="discount_rate must be"):
+        RewardRateWrapper(scripted_env(), discount_rate=-1.0)
+    env = RewardRateWrapper(scripted_env(rewards=lambda step, action: math.nan))
+    env.reset()
+    with pytest.raises(ValueError, match="not finite: nan"):
+        env.step(np.zeros(1))
+
+
+def test_the_wrapper_can_be_rebuilt_from_its_spec():
+    env = RewardRateWrapper(gym.make("Pendulum-v1"), discount_rate=0.1)
+    again = gym.make(env.spec)
+    assert again.option_settings == env.option_settings
+
+
+# --- the schedule of updates
+
+
+@pytest.mark.parametrize(
+    ("updates_per_step", "expected"),
+    [
+        (20 * 0.02, (5, 2)),  # 20 updates a second at 50 Hz
+        (20 * 0.01, (5, 1)),
+        (20 * 0.004, (25, 2)),
+        (20 * 0.002, (25, 1)),  # at 500 Hz
+        (20 * 0.05, (1, 1)),
+        (20 / 30, (3, 2)),
+        (3.0, (1, 3)),
+        (2.5, (2, 5)),
+    ],
+)
+def test_update_schedule_by_hand(updates_per_step, expected):
+    assert update_schedule(updates_per_step) == expected
+
+
+@given(st.floats(1e-3, 50.0))
+def test_update_schedule_keeps_the_rate(updates_per_step):
+    train_freq, gradient_steps = update_schedule(updates_per_step)
+    assert gradient_steps >= 1
+    assert gradient_steps / train_freq == pytest.approx(updates_per_step, rel=1.001e-3)
+    # and nothing smaller does
+    for smaller in range(1, min(train_freq, 50)):
+        assert abs(round(updates_per_step * smaller) / smaller / updates_per_step - 1) > 1e-3
+
+
+# --- the algorithm
+
+
+@pytest.mark.parametrize(("dt", "gamma"), [(0.05, 0.98), (0.1, 0.98**2), (0.002, 0.98**0.04)])
+def test_the_same_clock_at_every_dt(scripted_env, dt, gamma):
+    model = sac_at_rate(scripted_env(dt=dt), dt, learning_starts_seconds=3.0, **SMALL)
+    assert type(model) is SAC
+    assert model.gamma == pytest.approx(gamma)
+    assert model.learning_starts == round(3.0 / dt)
+    one = model.get_env().get_attr("option_settings")[0]
+    assert (one.dt, one.discount_rate) == (dt, pytest.approx(DEFAULT_DISCOUNT_RATE))
+    assert model.gradient_steps / model.train_freq.frequency == pytest.approx(20 * dt, rel=1e-3)
+
+
+def test_updates_are_counted_in_task_time(scripted_env):
+    """20 a second over 6 s, of which the first 2 s are random."""
+    for dt in (0.02, 0.01):
+        model = sac_at_rate(scripted_env(dt=dt), dt, learning_starts_seconds=2.0, **SMALL).learn(round(6.0 / dt))
+        assert model._n_updates == pytest.approx(80, abs=2)
+
+
+def test_several_environments_bring_more_task_time(scripted_env):
+    env = make_vec_env(lambda: scripted_env(dt=0.02), 2, wrapper_class=RewardRateWrapper)
+    model = sac_at_rate(env, 0.02, learning_starts_seconds=2.0, **SMALL).learn(300)
+    assert (model.train_freq.frequency, model.gradient_steps) == (5, 4)
+    assert model._n_updates == pytest.approx(80, abs=4)
+
+
+def test_returns_are_reported_as_they_are(scripted_env):
+    env = scripted_env(dt=0.1, truncate_at=10)
+    model = sac_at_rate(env, 0.1, learning_starts_seconds=100.0, **SMALL)
+    callback = DiscountedReturnCallback(DEFAULT_DISCOUNT_RATE)
+    model.learn(20, callback=callback)
+    # Monitor stands inside, so that the wrapper's scale does not show.
+    assert [info["r"] for info in model.ep_info_buffer] == [10.0, 10.0]
+    # ∫₀¹ e^(−τt) dt
+    expected = (1 - math.exp(-DEFAULT_DISCOUNT_RATE)) / DEFAULT_DISCOUNT_RATE
+    assert [episode.discounted_return for episode in callback.episodes] == pytest.approx([expected] * 2)
+    episodes = evaluate_discounted_return(model, RewardRateWrapper(scripted_env(dt=0.1, truncate_at=10)), 2)
+    assert [episode.discounted_return for episode in episodes] == pytest.approx([expected] * 2)
+
+
+def test_environments_that_are_wrapped_already(scripted_env):
+    env = RewardRateWrapper(Monitor(scripted_env(dt=0.1)))
+    assert sac_at_rate(env, 0.1, **SMALL).get_env().envs[0] is env
+    with pytest.raises(ValueError, match=r"RewardRateWrapper has dt=0\.1, sac_at_rate has dt=0\.2"):
+        sac_at_rate(env, 0.2, **SMALL)
+    with pytest.raises(ValueError, match="RewardRateWrapper has discount_rate="):
+        sac_at_rate(env, 0.1, gamma=0.9, **SMALL)
+    with pytest.raises(ValueError, match="wrapper_class=RewardRateWrapper"):
+        sac_at_rate(make_vec_env(scripted_env, 2), 0.1, **SMALL)
+
+
+@pytest.mark.parametrize(
+    ("kwargs", "error", "message"),
+    [
+        ({"dt": 0.0}, ValueError, "dt must be a positive"),
+        ({"updates_per_second": 0.0}, ValueError, "updates_per_second must be positive"),
+        ({"learning_starts_seconds": -1.0}, ValueError, "learning_starts_seconds must be at least 0"),
+        ({"gamma": 2.0}, ValueError, "gamma must be in"),
+        ({"gamma_dt": 0.0}, ValueError, "gamma_dt must be"),
+        ({"train_freq": 1}, TypeError, "sets train_freq itself"),
+        ({"gradient_steps": 1}, TypeError, "sets gradient_steps itself"),
+        ({"learning_starts": 100}, TypeError, "sets learning_starts itself"),
+    ],
+)
+def test_bad_settings(scripted_env, kwargs, error, message):
+    with pytest.raises(error, match=message):
+        sac_at_rate(**{"env": scripted_env(), "dt": 0.1, **kwargs})
+
+
+def test_a_saved_model_is_a_plain_sac(scripted_env, tmp_path):
+    model = sac_at_rate("Pendulum-v1", 0.05, learning_starts_seconds=1.0, updates_per_second=2.0, **SMALL).learn(60)
+    model.save(tmp_path / "sac.zip")
+    loaded = SAC.load(tmp_path / "sac.zip", RewardRateWrapper(gym.make("Pendulum-v1")))
+    assert loaded.gamma == model.gamma
+    obs = np.zeros((1, 3), dtype=np.float32)
+    np.testing.assert_array_equal(loaded.predict(obs, deterministic=True)[0], model.predict(obs, deterministic=True)[0])
+    loaded.learn(20, reset_num_timesteps=False)
+
+
+@pytest.mark.parametrize("documented", [module, reward_rate])
+def test_docstring_examples(documented):
+    result = doctest.testmod(documented)
+    assert result.attempted > 0
+    assert result.failed == 0
