@@ -123,6 +123,7 @@ class OptionExperimentManager(ExperimentManager):
         if any(WRAPPER in (wrapper if isinstance(wrapper, dict) else [wrapper]) for wrapper in wrappers):
             return wrappers
         algorithm = ALGOS[self.algo]
+        assert issubclass(algorithm, OptionOffPolicyAlgorithm)
         parameters = inspect.signature(algorithm).parameters
         arguments = {name: hyperparams.get(name, parameter.default) for name, parameter in parameters.items()}
         return [*wrappers, {WRAPPER: algorithm.wrapper_kwargs(arguments)}]
