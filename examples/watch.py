@@ -3,8 +3,9 @@
     python examples/watch.py model.zip --env Pendulum-v1
     MUJOCO_GL=egl python examples/watch.py model.zip --env sb3_ctco/ball_in_cup-catch-v0 --rate 50
 
-Writes episode.png and episode-episode-0.mp4 into --folder. The model is one that CTCO saved, or an exported .onnx; it
-drives the bare environment, which --rate makes with another dt if the environment takes one.
+Needs matplotlib, and moviepy for the video. Writes episode.png and episode-episode-0.mp4 into --folder. The model is one
+that CTCO saved, or an exported .onnx; it drives the bare environment, which --rate makes with another dt if the
+environment takes one.
 """
 
 import argparse

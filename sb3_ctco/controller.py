@@ -223,6 +223,7 @@ class OptionController:
         if which is None:
             self._executions = []
             self._now = None
+        if not self._executions:
             return
         indices = np.arange(len(self._executions))[np.asarray(which)]
         for i in np.atleast_1d(indices):
@@ -345,10 +346,10 @@ def _as_policy(policy: Any, deterministic: bool, vec_normalize: Any) -> OptionPo
         return OnnxPolicy(path)
     if path.suffix not in ("", ".zip"):
         raise ValueError(f"{path} must be a model saved as .zip or exported as .onnx")
-    # Here, because an exported policy needs none of this.
+    # Imported here, because an exported policy needs none of this; a controller needs no replay buffer.
     from sb3_ctco.ctco import CTCO  # noqa: PLC0415
 
-    return ModelPolicy(CTCO.load(path, device="cpu"), deterministic, _load_vec_normalize(vec_normalize))
+    return ModelPolicy(CTCO.load(path, device="cpu", buffer_size=1), deterministic, _load_vec_normalize(vec_normalize))
 
 
 def _load_vec_normalize(vec_normalize: Any) -> Any:

@@ -86,7 +86,9 @@ def export_onnx(
     space = model.observation_space
     named = dict(space.spaces) if isinstance(space, spaces.Dict) else {"observation": space}
     observations = {name: (_shape(leaf), str(leaf.dtype)) for name, leaf in named.items()}
-    actor = _GreedyActor(model.policy.actor, list(named) if isinstance(space, spaces.Dict) else None, policy.vec_normalize)
+    actor_network = model.policy.actor
+    assert isinstance(actor_network, nn.Module)
+    actor = _GreedyActor(actor_network, list(named) if isinstance(space, spaces.Dict) else None, policy.vec_normalize)
     # A batch of two, because the exporter takes a batch of one for a constant.
     examples = tuple(th.as_tensor(np.stack([leaf.sample()] * 2), device=model.device) for leaf in named.values())
 

@@ -72,6 +72,7 @@ def sample_ctco_params(trial: optuna.Trial, n_actions: int, n_envs: int, additio
             "learning_rate": trial.suggest_float("learning_rate", 1e-4, 3e-3, log=True),
             "duration_learning_rate": trial.suggest_float("duration_learning_rate", 1e-5, 3e-3, log=True),
             "updates_per_second": trial.suggest_float("updates_per_second", 5.0, 60.0, log=True),
+            "n_sub_options": trial.suggest_int("n_sub_options", 0, 8),
         }
     )
 
@@ -93,7 +94,8 @@ class OptionExperimentManager(ExperimentManager):
         hyperparams, saved = super().read_hyperparameters()
         if issubclass(ALGOS[self.algo], OptionOffPolicyAlgorithm):
             self._option_hyperparams = dict(hyperparams)
-            hyperparams["env_wrapper"] = saved["env_wrapper"] = self._wrappers(hyperparams)
+            hyperparams["env_wrapper"] = self._wrappers(hyperparams)
+            saved["env_wrapper"] = self._wrappers({**self._option_hyperparams, "n_sub_options": 0})
         return hyperparams, saved
 
     def objective(self, trial: optuna.Trial) -> float:
@@ -104,10 +106,14 @@ class OptionExperimentManager(ExperimentManager):
         return super(OptionExperimentManager, manager).objective(trial)
 
     def create_envs(self, n_envs: int, eval_env: bool = False, no_log: bool = False) -> VecEnv:
-        """The Zoo's; within a trial with the settings that it sampled."""
-        if self._trial is not None and self._option_hyperparams is not None:
-            # By now the sampler has run, and names of parameters are those of CTCO's arguments.
-            hyperparams = {**self._option_hyperparams, **self._trial.params}
+        """The Zoo's; within a trial with the settings that it sampled, and without sub-options to evaluate in."""
+        if self._option_hyperparams is not None:
+            hyperparams = dict(self._option_hyperparams)
+            if self._trial is not None:
+                # By now the sampler has run, and names of parameters are those of CTCO's arguments.
+                hyperparams.update(self._trial.params)
+            if eval_env:
+                hyperparams["n_sub_options"] = 0
             self.env_wrapper = get_wrapper_class({"env_wrapper": self._wrappers(hyperparams)})
         return super().create_envs(n_envs, eval_env, no_log)
 

@@ -192,6 +192,13 @@ def test_reset_of_one_among_several(which, clock):
     np.testing.assert_allclose(controller.elapsed, [0.1, 0.0, 0.1])
 
 
+def test_reset_of_some_before_the_first_tick_does_nothing():
+    controller = OptionController(ScriptedPolicy((0.0, 0.0, 0.4)))
+    controller.reset([0, 1])
+    controller(np.zeros((2, 3)))
+    np.testing.assert_allclose(controller.elapsed, [0.0, 0.0])
+
+
 def test_reset_decides_anew_and_forgets_the_clock():
     policy = ScriptedPolicy((0.0, 0.0, 0.4))
     controller = OptionController(policy)
@@ -373,5 +380,6 @@ def test_the_model_remembers_the_bare_environments_actions(tmp_path, pendulum_mo
 def test_a_controller_can_be_pickled(pendulum_model):
     controller = OptionController(ScriptedPolicy((0.5, 0.5, 0.3)))
     controller(np.zeros(3))
+    assert controller.option.shape == (3,)
     copy = pickle.loads(pickle.dumps(controller))
     assert copy.remaining == controller.remaining

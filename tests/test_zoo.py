@@ -74,14 +74,17 @@ def test_each_entry_builds_and_takes_200_steps(tmp_path, models, algo, name):
 
 
 def test_the_wrapper_has_the_settings_of_the_entry_and_the_command_line(tmp_path, models):
-    params = [*FEW_STEPS_PARAMS, "n_rbf:4", "gamma:0.9", "gamma_dt:0.1"]
+    params = [*FEW_STEPS_PARAMS, "n_rbf:4", "gamma:0.9", "gamma_dt:0.1", "n_sub_options:2"]
     main(["train", "--env", "Pendulum-v1", "-f", str(tmp_path), *FEW_STEPS, *params])
     (model,) = models
     assert model.n_rbf == 4
     assert model.d_max == entries("ctco")["Pendulum-v1"]["d_max"]
     assert model.option_settings.discount_rate == pytest.approx(-np.log(0.9) / 0.1)
+    assert model.get_env().get_attr("n_sub_options") == [2]
     saved = yaml.unsafe_load((tmp_path / "ctco/Pendulum-v1_1/Pendulum-v1/config.yml").read_text())
-    assert saved["env_wrapper"][0]["sb3_ctco.wrappers.OptionExecutionWrapper"]["n_rbf"] == 4
+    wrapper = saved["env_wrapper"][0]["sb3_ctco.wrappers.OptionExecutionWrapper"]
+    # What enjoy makes its environment with: sub-options are for learning only.
+    assert (wrapper["n_rbf"], wrapper["n_sub_options"]) == (4, 0)
 
 
 def test_other_wrappers_of_an_entry_go_inside(tmp_path, models):
