@@ -27,7 +27,7 @@ DM_CONTROL_TASKS: dict[str, tuple[str, ...]] = {
 
 
 def register_envs() -> None:
-    """Register ``sb3_ctco/<domain>-<task>-v0`` for every task of dm_control's suite; once is enough."""
+    """Register dm_control's tasks as ``sb3_ctco/<domain>-<task>-v0``, and visual reaching; once is enough."""
     for domain, tasks in DM_CONTROL_TASKS.items():
         for task in tasks:
             env_id = f"sb3_ctco/{domain}-{task}-v0"
@@ -37,3 +37,11 @@ def register_envs() -> None:
                     entry_point="sb3_ctco.envs.dm_control:DMControlEnv",
                     kwargs={"domain": domain, "task": task},
                 )
+    for difficulty in ("easy", "hard"):
+        env_id = f"sb3_ctco/visual_reacher-{difficulty}-v0"
+        if env_id not in gym.registry:
+            gym.register(
+                env_id,
+                entry_point="sb3_ctco.envs.visual_reacher:VisualReacherEnv",
+                kwargs={"difficulty": difficulty},
+            )
