@@ -140,7 +140,7 @@ class VisualReacherEnv(gym.Env[dict[str, np.ndarray], np.ndarray]):
         self.action_space = spaces.Box(-MAX_VELOCITY, MAX_VELOCITY, (n,), np.float32)
         low = np.concatenate([JOINT_LIMITS[0], -speed, -speed]).astype(np.float32)
         high = np.concatenate([JOINT_LIMITS[1], speed, speed]).astype(np.float32)
-        self.observation_space = spaces.Dict(
+        self.observation_space = spaces.Dict(  # type: ignore[assignment]
             {
                 "image": spaces.Box(0, 255, (HEIGHT, WIDTH, 3), np.uint8),
                 "proprioception": spaces.Box(low, high, dtype=np.float32),
