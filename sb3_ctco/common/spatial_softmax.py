@@ -83,7 +83,11 @@ class SpatialSoftmaxExtractor(BaseFeaturesExtractor):
         if max_shift < 0:
             raise ValueError(f"max_shift must be a number of pixels that is at least 0, not {max_shift}")
         entries = observation_space.spaces if isinstance(observation_space, spaces.Dict) else {"": observation_space}
-        images = {key: space for key, space in entries.items() if is_image_space(space, normalized_image=normalized_image)}
+        images: dict[str, spaces.Box] = {
+            key: space
+            for key, space in entries.items()
+            if isinstance(space, spaces.Box) and is_image_space(space, normalized_image=normalized_image)
+        }
         if not images:
             raise ValueError(
                 f"SpatialSoftmaxExtractor needs a picture, and {observation_space} has none: a picture is a uint8 Box of "
