@@ -127,7 +127,8 @@ class SpatialSoftmaxExtractor(BaseFeaturesExtractor):
                 image = image.permute(0, 3, 1, 2)
             if self.training and self.max_shift:
                 image = random_shift(image, self.max_shift)
-            features.append(encoder(image))
+            # On a processor convolutions take about two thirds of the time in this layout.
+            features.append(encoder(image.contiguous(memory_format=th.channels_last)))
         for key in self._vector_keys:
             vector = entries[key].flatten(1)
             if key in self._bounded:
@@ -143,4 +144,5 @@ def _encoder(in_channels: int, n_channels: int) -> nn.Sequential:
     for stride in (2, 2, 2):
         layers += [nn.Conv2d(in_channels, n_channels, 3, stride, padding=1), nn.ReLU()]
         in_channels = n_channels
-    return nn.Sequential(*layers, nn.Conv2d(n_channels, n_channels, 3, padding=1), SpatialSoftmax())
+    encoder = nn.Sequential(*layers, nn.Conv2d(n_channels, n_channels, 3, padding=1), SpatialSoftmax())
+    return encoder.to(memory_format=th.channels_last)

@@ -44,7 +44,7 @@ AlgorithmType = TypeVar("AlgorithmType", bound=OffPolicyAlgorithm)
 #: How long the learner may take to start and to read what was collected before, in s
 _START_SECONDS = 120.0
 #: How long it may take to stop and save before it is killed, in s
-_STOP_SECONDS = 10.0
+_STOP_SECONDS = 60.0
 
 
 def send_zero(env: gym.Env) -> None:
