@@ -448,3 +448,28 @@ def test_decide_ahead_in_real_time(tmp_path):
 def test_decide_ahead_out_of_range(decide_ahead):
     with pytest.raises(ValueError, match=f"less than d_max=0.2 s, not {decide_ahead}"):
         RealTimeOptionWrapper(Point(), decide_ahead=decide_ahead, d_max=0.2)
+
+
+def test_acting_priority_is_in_force_while_acting(tmp_path):
+    if not hasattr(os, "sched_setscheduler"):
+        pytest.skip("this operating system has no real-time scheduler to ask for")
+    before = os.sched_getscheduler(0)
+    try:
+        os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(1))
+    except PermissionError:
+        pytest.skip("this user may not ask for the real-time scheduler")
+    os.sched_setscheduler(0, before, os.sched_param(0))
+    env = Point()
+    model = make_model(SAC, env)
+    seen = set()
+
+    def watch(local_variables, global_variables):
+        seen.add((os.sched_getscheduler(0) & os.SCHED_FIFO, os.sched_getparam(0).sched_priority))
+        return True
+
+    with AsynchronousTrainer(model, env, tmp_path, acting_priority=7) as trainer:
+        trainer.learn(20, watch)
+    assert seen == {(os.SCHED_FIFO, 7)}
+    assert os.sched_getscheduler(0) == before
+    with pytest.raises(ValueError, match="from 1 to 99, not 0"):
+        AsynchronousTrainer(model, env, tmp_path / "other", acting_priority=0)

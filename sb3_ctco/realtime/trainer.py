@@ -1,6 +1,7 @@
 """The acting process: keeps the clock, never waits for the learner, and leaves the machine in a safe state."""
 
 import multiprocessing
+import os
 import signal
 import threading
 import time
@@ -94,6 +95,8 @@ class AsynchronousTrainer(Generic[AlgorithmType]):
     :param learner_device: device to learn on
     :param learner_threads: torch's threads of the learner; None for torch's own choice
     :param learner_niceness: how much less urgent learning is to the operating system than acting
+    :param acting_priority: priority of the acting thread under Linux's real-time scheduler (SCHED_FIFO, 1 to 99), which no
+        ordinary process delays; needs root or CAP_SYS_NICE. None leaves it to the ordinary scheduler
     :param checkpoint_seconds: between two checkpoints of the learner
     :param decide_ahead: decide on the next option this many seconds before the current one ends, see
         :class:`~sb3_ctco.wrappers.RealTimeOptionWrapper`; for algorithms with options
@@ -114,6 +117,7 @@ class AsynchronousTrainer(Generic[AlgorithmType]):
         learner_device: str = "auto",
         learner_threads: int | None = 1,
         learner_niceness: int = 10,
+        acting_priority: int | None = None,
         checkpoint_seconds: float = 60.0,
         decide_ahead: float = 0.0,
         interrupt: Interrupt | None = None,
@@ -133,6 +137,8 @@ class AsynchronousTrainer(Generic[AlgorithmType]):
             )
         if updates_per_second is not None and not updates_per_second > 0:
             raise ValueError(f"updates_per_second must be positive or None, not {updates_per_second}")
+        if acting_priority is not None and not (hasattr(os, "sched_setscheduler") and 1 <= acting_priority <= 99):
+            raise ValueError(f"acting_priority must be None or, on Linux, from 1 to 99, not {acting_priority}")
         reactive = decide_ahead > 0 or interrupt is not None
         if reactive and not isinstance(model, OptionOffPolicyAlgorithm):
             raise ValueError(
@@ -147,6 +153,7 @@ class AsynchronousTrainer(Generic[AlgorithmType]):
         self.model = model
         self.bare_env = env.unwrapped
         self.safe_stop = safe_stop
+        self.acting_priority = acting_priority
         #: Counts late ticks; None without ``real_time``
         self.real_time: RealTimeWrapper | None = None
         if real_time:
@@ -229,14 +236,15 @@ class AsynchronousTrainer(Generic[AlgorithmType]):
                 excluded = [*model._excluded_save_params(), *overrides, "_excluded_save_params"]
                 # What is put on the instance hides the class's own methods; a CheckpointCallback must not save it.
                 model.__dict__.update(overrides, _excluded_save_params=lambda: excluded)
-                model.learn(
-                    remaining,
-                    CallbackList(callbacks),
-                    log_interval=log_interval,
-                    tb_log_name=tb_log_name,
-                    reset_num_timesteps=model.num_timesteps == 0,
-                    progress_bar=progress_bar,
-                )
+                with _scheduled(self.acting_priority):
+                    model.learn(
+                        remaining,
+                        CallbackList(callbacks),
+                        log_interval=log_interval,
+                        tb_log_name=tb_log_name,
+                        reset_num_timesteps=model.num_timesteps == 0,
+                        progress_bar=progress_bar,
+                    )
         finally:
             self._supervisor.check = None
             try:
@@ -437,3 +445,23 @@ def _sigterm_as_exit() -> Iterator[None]:
         yield
     finally:
         signal.signal(signal.SIGTERM, before)
+
+
+@contextmanager
+def _scheduled(priority: int | None) -> Iterator[None]:
+    """Run this thread, and those that it starts meanwhile (the rest of an option plays in one), under the real-time scheduler."""
+    if priority is None:
+        yield
+        return
+    before = os.sched_getscheduler(0), os.sched_getparam(0)
+    try:
+        os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(priority))
+    except PermissionError:
+        raise PermissionError(
+            f"acting_priority={priority} needs root or CAP_SYS_NICE: grant it (sudo, or rtprio in /etc/security/limits.conf), "
+            "or pass None"
+        ) from None
+    try:
+        yield
+    finally:
+        os.sched_setscheduler(0, *before)
