@@ -437,11 +437,14 @@ def test_decide_ahead_in_real_time(tmp_path):
     model = make_model(CTCO, env, n_rbf=1, d_max=0.2, d_min=0.1)
     with AsynchronousTrainer(model, env, tmp_path, decide_ahead=0.04) as trainer:
         trainer.learn(200)
-        statistics = trainer.real_time.total_statistics
     assert env.commands[-1] == 0.0
-    assert statistics.ticks > 150
-    assert statistics.late_ticks < 0.5 * statistics.ticks
-    assert records_of(tmp_path)[-1].num_timesteps == model.num_timesteps
+    records = records_of(tmp_path)
+    assert records[-1].num_timesteps == model.num_timesteps
+    # The first decision of an episode is 0.04 s short of its option; the next ones come when an option's time has run.
+    assert {len(r.infos) for r in records} == {1}
+    steps = [r.infos[0]["option"]["n_steps"] for r in records]
+    assert sum(steps) == model.num_timesteps
+    assert 3 <= steps[0] <= 8
 
 
 @pytest.mark.parametrize("decide_ahead", [-0.1, 0.2])

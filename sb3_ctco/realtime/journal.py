@@ -26,8 +26,7 @@ class JournalWriter:
         self._file.truncate(end)
         self._records: queue.SimpleQueue[Any] = queue.SimpleQueue()
         self._error: OSError | None = None
-        self._thread = threading.Thread(target=self._write, name="journal", daemon=True)
-        self._thread.start()
+        self._thread: threading.Thread | None = None
 
     def add(self, record: Any) -> None:
         """Append a record, some time soon.
@@ -37,6 +36,11 @@ class JournalWriter:
         """
         if self._error is not None:
             raise OSError(f"experience cannot be written to {self._file.name}: {self._error}") from self._error
+        if self._thread is None:
+            # Only here, so that it has the priority of the thread that adds: it must not hold that one up by being slow
+            # to let go of the interpreter.
+            self._thread = threading.Thread(target=self._write, name="journal", daemon=True)
+            self._thread.start()
         self._records.put(record)
 
     def close(self) -> None:
@@ -44,8 +48,9 @@ class JournalWriter:
 
         :raises OSError: if a record could not be written
         """
-        self._records.put(None)
-        self._thread.join()
+        if self._thread is not None:
+            self._records.put(None)
+            self._thread.join()
         self._file.close()
         if self._error is not None:
             raise OSError(f"experience cannot be written to {self._file.name}: {self._error}") from self._error
