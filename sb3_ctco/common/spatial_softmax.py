@@ -145,4 +145,4 @@ def _encoder(in_channels: int, n_channels: int) -> nn.Sequential:
         layers += [nn.Conv2d(in_channels, n_channels, 3, stride, padding=1), nn.ReLU()]
         in_channels = n_channels
     encoder = nn.Sequential(*layers, nn.Conv2d(n_channels, n_channels, 3, padding=1), SpatialSoftmax())
-    return encoder.to(memory_format=th.channels_last)
+    return encoder.to(memory_format=th.channels_last)  # type: ignore[call-overload]
