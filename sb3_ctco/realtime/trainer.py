@@ -76,8 +76,8 @@ class AsynchronousTrainer(Generic[AlgorithmType]):
     checkpoint, with all of them.
 
     However learning ends (Ctrl-C, SIGTERM, an exception on either side, a learner that was killed), the last command is
-    the safe one; then the learner ends its round of updates (0.1 s, or one update), saves and stops. A script that uses it needs
-    ``if __name__ == "__main__":``, because the learner's process imports it.
+    the safe one; then the learner ends its round of updates (0.1 s, or one update), saves and stops. A script that uses
+    it needs ``if __name__ == "__main__":``, because the learner's process imports it.
 
     ::
 
