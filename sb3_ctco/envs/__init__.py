@@ -37,7 +37,7 @@ STUDY_RATES = (50, 100, 250, 500)
 
 
 def register_envs() -> None:
-    """Register dm_control's suite and the paper's settings with Gymnasium; once is enough.
+    """Register dm_control's suite, the paper's settings and visual reaching with Gymnasium; once is enough.
 
     ``sb3_ctco/<domain>-<task>-v0`` is each task of the suite, and ``sb3_ctco/<study task>-<rate>hz-v0`` each task of the
     paper's study at each of its frequencies, for tools that know an environment by its id alone.
@@ -53,3 +53,11 @@ def register_envs() -> None:
     for env_id, kwargs in ids.items():
         if env_id not in gym.registry:
             gym.register(env_id, entry_point="sb3_ctco.envs.dm_control:DMControlEnv", kwargs=kwargs)
+    for difficulty in ("easy", "hard"):
+        env_id = f"sb3_ctco/visual_reacher-{difficulty}-v0"
+        if env_id not in gym.registry:
+            gym.register(
+                env_id,
+                entry_point="sb3_ctco.envs.visual_reacher:VisualReacherEnv",
+                kwargs={"difficulty": difficulty},
+            )

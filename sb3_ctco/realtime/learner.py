@@ -1,0 +1,169 @@
+"""The learning process: reads experience from the journal, updates, publishes weights."""
+
+import multiprocessing
+import os
+import signal
+import time
+import traceback
+from dataclasses import dataclass
+from multiprocessing.connection import Connection
+from multiprocessing.synchronize import Event
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+import torch as th
+from stable_baselines3.common.logger import Logger
+from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
+
+from sb3_ctco.realtime.journal import JournalReader
+from sb3_ctco.realtime.weights import SharedWeights
+
+#: An update's share of a round is kept below this, so that a round can be stopped in time; in s
+_ROUND_SECONDS = 0.1
+_LOG_SECONDS = 1.0
+
+
+class LearnerError(RuntimeError):
+    """The learning process failed or was killed; acting was stopped safely."""
+
+
+class Transition(NamedTuple):
+    """What ``ReplayBuffer.add`` takes, and the number of environment steps that had been made by then."""
+
+    obs: np.ndarray | dict[str, np.ndarray]
+    next_obs: np.ndarray | dict[str, np.ndarray]
+    action: np.ndarray
+    reward: np.ndarray
+    done: np.ndarray
+    infos: list[dict[str, Any]]
+    num_timesteps: int
+
+
+@dataclass(frozen=True)
+class LearnerSettings:
+    """What the learning process is told.
+
+    :param algorithm: class of the model
+    :param start: file of the model to begin with
+    :param folder: of the journal and the checkpoints
+    :param total_timesteps: for schedules
+    :param device: to learn on
+    :param n_threads: of torch; None for its own choice
+    :param niceness: how much less urgent than acting
+    :param updates_per_second: at most; None for as many as possible
+    :param checkpoint_seconds: between two checkpoints
+    """
+
+    algorithm: type[OffPolicyAlgorithm]
+    start: Path
+    folder: Path
+    total_timesteps: int
+    device: str
+    n_threads: int | None
+    niceness: int
+    updates_per_second: float | None
+    checkpoint_seconds: float
+
+
+def acting_module(model: OffPolicyAlgorithm) -> th.nn.Module:
+    """The part of a policy that acting needs."""
+    actor = getattr(model.policy, "actor", None)
+    return actor if isinstance(actor, th.nn.Module) else model.policy
+
+
+def run_learner(settings: LearnerSettings, weights: SharedWeights, stop: Event, report: Connection) -> None:
+    """Learn until told to stop or left alone, then save. Runs in a process of its own.
+
+    What it reports is ``("ready", None)``, ``("log", {name: value})`` and ``("failed", traceback)``.
+    """
+    # Ctrl-C reaches every process of the terminal; the acting one decides what to do about it.
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    os.nice(settings.niceness)
+    if settings.n_threads is not None:
+        th.set_num_threads(settings.n_threads)
+    try:
+        learner = _Learner(settings, weights, stop, report)
+    except Exception:
+        report.send(("failed", traceback.format_exc()))
+        raise SystemExit(1) from None
+    try:
+        report.send(("ready", None))
+        learner.run()
+    except (BrokenPipeError, ConnectionResetError):
+        pass  # the acting process is gone
+    except Exception:
+        report.send(("failed", traceback.format_exc()))
+        raise SystemExit(1) from None
+    finally:
+        learner.save()
+
+
+class _Learner:
+    def __init__(self, settings: LearnerSettings, weights: SharedWeights, stop: Event, report: Connection):
+        self.settings = settings
+        self.weights = weights
+        self.stop = stop
+        self.report = report
+        self.model = settings.algorithm.load(settings.start, device=settings.device)
+        self.model._total_timesteps = settings.total_timesteps
+        self.model.set_logger(Logger(folder=None, output_formats=[]))
+        self.journal = JournalReader(settings.folder / "journal")
+        self.num_updates = 0
+
+    def run(self) -> None:
+        """Alternate between reading what was collected and a short round of updates."""
+        parent = multiprocessing.parent_process()
+        assert parent is not None
+        model, settings = self.model, self.settings
+        assert model.replay_buffer is not None
+        seconds_per_update = _ROUND_SECONDS
+        started: float | None = None
+        logged_at = saved_at = time.monotonic()
+        updates_logged = 0
+        while not self.stop.is_set() and parent.is_alive():
+            n_read = fill_replay_buffer(model, self.journal, 1000)
+            if n_read == 1000:
+                continue  # learning waits until all that was collected before is read
+            now = time.monotonic()
+            ready = model.num_timesteps > model.learning_starts and model.replay_buffer.size() > 0
+            n_updates = max(1, int(_ROUND_SECONDS / seconds_per_update))
+            if ready and settings.updates_per_second is not None:
+                started = now if started is None else started
+                due = (now - started) * settings.updates_per_second - self.num_updates
+                n_updates = min(n_updates, int(due))
+            if ready and n_updates > 0:
+                model._update_current_progress_remaining(model.num_timesteps, settings.total_timesteps)
+                model.train(gradient_steps=n_updates, batch_size=model.batch_size)
+                self.num_updates += n_updates
+                self.weights.publish(acting_module(model))
+                seconds_per_update = max(1e-5, (time.monotonic() - now) / n_updates)
+            else:
+                time.sleep(0.002)
+            if now - logged_at > _LOG_SECONDS:
+                values = {k: v for k, v in model.logger.name_to_value.items() if isinstance(v, int | float)}
+                values["asynchronous/updates_per_second"] = (self.num_updates - updates_logged) / (now - logged_at)
+                self.report.send(("log", values))
+                logged_at, updates_logged = now, self.num_updates
+            if now - saved_at > settings.checkpoint_seconds:
+                self.save()
+                saved_at = now
+
+    def save(self) -> None:
+        """Write a checkpoint, in one move."""
+        unfinished = self.settings.folder / "model.unfinished.zip"
+        self.model.save(unfinished)
+        os.replace(unfinished, self.settings.folder / "model.zip")
+
+
+def fill_replay_buffer(model: OffPolicyAlgorithm, journal: JournalReader, max_records: int) -> int:
+    """Move transitions from a journal to a model's replay buffer.
+
+    :return: how many
+    """
+    assert model.replay_buffer is not None
+    records: list[Transition] = journal.read(max_records)
+    for record in records:
+        model.replay_buffer.add(*record[:-1])  # type: ignore[arg-type]
+        model.num_timesteps = record.num_timesteps
+    return len(records)

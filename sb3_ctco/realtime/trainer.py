@@ -1,0 +1,479 @@
+"""The acting process: keeps the clock, never waits for the learner, and leaves the machine in a safe state."""
+
+import multiprocessing
+import os
+import signal
+import sys
+import threading
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any, Generic, TypeVar
+
+import gymnasium as gym
+import numpy as np
+import torch as th
+from gymnasium.error import ResetNeeded
+from stable_baselines3 import HerReplayBuffer
+from stable_baselines3.common.callbacks import BaseCallback, CallbackList, ConvertCallback
+from stable_baselines3.common.env_util import unwrap_wrapper
+from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
+from stable_baselines3.common.type_aliases import MaybeCallback
+
+from sb3_ctco.common.option_algorithm import OptionOffPolicyAlgorithm
+from sb3_ctco.realtime.journal import JournalReader, JournalWriter
+from sb3_ctco.realtime.learner import (
+    LearnerError,
+    LearnerSettings,
+    Transition,
+    acting_module,
+    fill_replay_buffer,
+    run_learner,
+)
+from sb3_ctco.realtime.weights import SharedWeights
+from sb3_ctco.wrappers import (
+    Interrupt,
+    OptionExecutionWrapper,
+    RealTimeOptionWrapper,
+    RealTimeWrapper,
+    SupportsSendReceive,
+)
+
+SafeStop = Callable[[gym.Env], None]
+AlgorithmType = TypeVar("AlgorithmType", bound=OffPolicyAlgorithm)
+
+#: How long the learner may take to start and to read what was collected before, in s
+_START_SECONDS = 120.0
+#: How long it may take to stop and save before it is killed, in s
+_STOP_SECONDS = 60.0
+
+
+def send_zero(env: gym.Env) -> None:
+    """Command zero, which stops a machine that is controlled by velocities.
+
+    :param env: the bare environment, with ``send`` or only with ``step``; one whose episode has ended is left alone
+    """
+    space = env.action_space
+    action = np.zeros(space.shape or (), dtype=space.dtype)
+    if isinstance(env, SupportsSendReceive):
+        env.send(action)
+        return
+    try:
+        env.step(action)
+    except ResetNeeded:
+        return
+
+
+class AsynchronousTrainer(Generic[AlgorithmType]):
+    """Act in this process and learn in another one, for any off-policy algorithm of Stable-Baselines3.
+
+    Acting keeps the period of the environment by the wall clock and never waits for the learner. Every transition is
+    written to ``folder/journal``, from which the learner fills its replay buffer: whatever was collected survives the
+    end of either process. Weights come back through shared memory, with a version, and are picked up between two
+    decisions. Callbacks, the logger and the progress bar are those of ``model.learn``; the model that they see has the
+    weights in use, but critics and optimizers only once learning is over. ``folder/model.zip`` is the learner's
+    checkpoint, with all of them.
+
+    However learning ends (Ctrl-C, SIGTERM, an exception on either side, a learner that was killed), the last command is
+    the safe one; then the learner ends its round of updates (0.1 s, or one update), saves and stops. A script that uses
+    it needs ``if __name__ == "__main__":``, because the learner's process imports it.
+
+    ::
+
+        model = CTCO("MlpPolicy", env)
+        with AsynchronousTrainer(model, env, folder="runs/arm") as trainer:
+            trainer.learn(100_000, progress_bar=True)
+
+    :param model: CTCO, SAC or another off-policy algorithm; the device it is on is used for acting, best the CPU
+    :param env: the bare environment; it must tell its period, or be wrapped in
+        :class:`~sb3_ctco.wrappers.RealTimeWrapper` already
+    :param folder: for the journal and the checkpoints
+    :param resume: continue what is in ``folder``; without it, an existing journal is an error
+    :param real_time: whether to hold the wall-clock period; False plays a simulation as fast as it goes
+    :param safe_stop: called with the bare environment to leave the machine in a safe state; by default it commands zero
+    :param updates_per_second: at most so many updates; None for as many as the learner's processor can do
+    :param learner_device: device to learn on
+    :param learner_threads: torch's threads of the learner; None for torch's own choice
+    :param learner_niceness: how much less urgent learning is to the operating system than acting
+    :param acting_priority: priority of the acting thread under Linux's real-time scheduler (SCHED_FIFO, 1 to 99), which no
+        ordinary process delays; needs root or CAP_SYS_NICE. None leaves it to the ordinary scheduler
+    :param checkpoint_seconds: between two checkpoints of the learner
+    :param decide_ahead: decide on the next option this many seconds before the current one ends, see
+        :class:`~sb3_ctco.wrappers.RealTimeOptionWrapper`; for algorithms with options
+    :param interrupt: ends an option early, see there; for algorithms with options
+    :raises ValueError: for an environment, a model or settings that cannot be right
+    :raises FileExistsError: if ``folder`` holds a journal and ``resume`` is not asked for
+    """
+
+    def __init__(
+        self,
+        model: AlgorithmType,
+        env: gym.Env,
+        folder: str | Path,
+        resume: bool = False,
+        real_time: bool = True,
+        safe_stop: SafeStop = send_zero,
+        updates_per_second: float | None = None,
+        learner_device: str = "auto",
+        learner_threads: int | None = 1,
+        learner_niceness: int = 10,
+        acting_priority: int | None = None,
+        checkpoint_seconds: float = 60.0,
+        decide_ahead: float = 0.0,
+        interrupt: Interrupt | None = None,
+    ):
+        if not isinstance(model, OffPolicyAlgorithm):
+            raise ValueError(
+                f"AsynchronousTrainer needs an off-policy algorithm such as CTCO or SAC, not {type(model).__name__}"
+            )
+        if not isinstance(env, gym.Env) or unwrap_wrapper(env, OptionExecutionWrapper) is not None:
+            raise ValueError(
+                f"pass one bare Gymnasium environment, not {env}: AsynchronousTrainer wraps it itself, with the settings of "
+                "the model"
+            )
+        if model.replay_buffer_class is not None and issubclass(model.replay_buffer_class, HerReplayBuffer):
+            raise ValueError(
+                "HerReplayBuffer is not supported: it computes rewards with the environment, which the learner has not"
+            )
+        if updates_per_second is not None and not updates_per_second > 0:
+            raise ValueError(f"updates_per_second must be positive or None, not {updates_per_second}")
+        if acting_priority is not None and not (hasattr(os, "sched_setscheduler") and 1 <= acting_priority <= 99):
+            raise ValueError(f"acting_priority must be None or, on Linux, from 1 to 99, not {acting_priority}")
+        reactive = decide_ahead > 0 or interrupt is not None
+        if reactive and not isinstance(model, OptionOffPolicyAlgorithm):
+            raise ValueError(
+                f"decide_ahead and interrupt are for algorithms with options, which {type(model).__name__} is not"
+            )
+        self.folder = Path(folder)
+        if (self.folder / "journal").exists() and not resume:
+            raise FileExistsError(
+                f"{self.folder} holds the experience of an earlier run: pass resume=True to continue it, or another folder"
+            )
+        self.folder.mkdir(parents=True, exist_ok=True)
+        self.model = model
+        self.bare_env = env.unwrapped
+        self.safe_stop = safe_stop
+        self.acting_priority = acting_priority
+        #: Counts late ticks; None without ``real_time``
+        self.real_time: RealTimeWrapper | None = None
+        if real_time:
+            found = unwrap_wrapper(env, RealTimeWrapper)
+            env = RealTimeWrapper(env) if found is None else env
+            self.real_time = env if found is None else found  # type: ignore[assignment]
+        self._supervisor = _Supervisor(env)
+        wrapped: gym.Env = self._supervisor
+        if reactive:
+            assert isinstance(model, OptionOffPolicyAlgorithm)
+            wrapped = RealTimeOptionWrapper.like(
+                model.wrap_env(wrapped), decide_ahead=decide_ahead, interrupt=interrupt, background=real_time
+            )
+        model.set_env(wrapped)
+        if model.seed is not None:
+            model.env.seed(model.seed)  # type: ignore[union-attr]
+        self._settings: dict[str, Any] = {
+            "device": learner_device,
+            "n_threads": learner_threads,
+            "niceness": learner_niceness,
+            "updates_per_second": updates_per_second,
+            "checkpoint_seconds": checkpoint_seconds,
+        }
+        #: Seconds that each decision took the policy, the latest last
+        self.decision_seconds: list[float] = []
+        #: Age in s of the weights that each decision was made with
+        self.weight_ages: list[float] = []
+        if resume:
+            self._load_checkpoint()
+            self._count_timesteps()
+
+    def __enter__(self) -> "AsynchronousTrainer[AlgorithmType]":
+        return self
+
+    def __exit__(self, *exception: object) -> None:
+        self._supervisor.close()
+
+    def learn(
+        self,
+        total_timesteps: int,
+        callback: MaybeCallback = None,
+        log_interval: int = 4,
+        tb_log_name: str = "asynchronous",
+        progress_bar: bool = False,
+    ) -> AlgorithmType:
+        """Act until ``total_timesteps`` environment steps have been made in all, what was resumed included.
+
+        :return: the model, with everything that the learner learned
+        :raises LearnerError: if the learner failed or was killed
+        """
+        model = self.model
+        remaining = total_timesteps - model.num_timesteps
+        if remaining <= 0:
+            return model
+        context = multiprocessing.get_context("spawn")
+        weights = SharedWeights(acting_module(model), context)
+        stop = context.Event()
+        report, learner_end = context.Pipe(duplex=False)
+        journal = JournalWriter(self.folder / "journal")
+        start = self.folder / "start.zip"
+        model.save(start)
+        settings = LearnerSettings(type(model), start, self.folder, total_timesteps, **self._settings)
+        process = context.Process(target=run_learner, args=(settings, weights, stop, learner_end), name="learner", daemon=True)
+        process.start()
+        learner_end.close()
+        link = _Link(process, report, weights, model)
+        own = _AsynchronousCallback(self, link)
+        callbacks: list[BaseCallback] = [own]
+        if isinstance(callback, list):
+            callbacks += callback
+        elif callback is not None:
+            callbacks.append(callback if isinstance(callback, BaseCallback) else ConvertCallback(callback))
+        replay_buffer = model.replay_buffer
+        try:
+            with _sigterm_as_exit():
+                link.wait_until_ready()
+                self._supervisor.check = link.check
+                model.replay_buffer = _JournalBuffer(journal, model)  # type: ignore[assignment]
+                overrides = {"train": _learned_elsewhere, "_sample_action": self._timed(model._sample_action, weights)}
+                excluded = [*model._excluded_save_params(), *overrides, "_excluded_save_params"]
+                # What is put on the instance hides the class's own methods; a CheckpointCallback must not save it.
+                model.__dict__.update(overrides, _excluded_save_params=lambda: excluded)
+                with _prompt_threads(), _scheduled(self.acting_priority):
+                    model.learn(
+                        remaining,
+                        CallbackList(callbacks),
+                        log_interval=log_interval,
+                        tb_log_name=tb_log_name,
+                        reset_num_timesteps=model.num_timesteps == 0,
+                        progress_bar=progress_bar,
+                    )
+        finally:
+            self._supervisor.check = None
+            try:
+                self._make_safe()
+            finally:
+                model.replay_buffer = replay_buffer
+                for name in ("train", "_sample_action", "_excluded_save_params"):
+                    model.__dict__.pop(name, None)
+                try:
+                    journal.close()
+                finally:
+                    stop.set()
+                    link.join()
+        link.raise_if_failed()
+        self._load_checkpoint()
+        return model
+
+    def restore_replay_buffer(self) -> None:
+        """Fill the model's own replay buffer with everything that was collected, for instance to learn on in place."""
+        journal = JournalReader(self.folder / "journal")
+        while fill_replay_buffer(self.model, journal, 1000):
+            pass
+        journal.close()
+
+    def _make_safe(self) -> None:
+        option_env = unwrap_wrapper(self.model.env.envs[0], RealTimeOptionWrapper)  # type: ignore[union-attr]
+        if isinstance(option_env, RealTimeOptionWrapper):
+            option_env.abandon()
+        if self._supervisor.has_commanded:
+            self.safe_stop(self.bare_env)
+
+    def _load_checkpoint(self) -> None:
+        path = self.folder / "model.zip"
+        if not path.exists():
+            return
+        model = self.model
+        learned = type(model).load(path, device=model.device)
+        model.set_parameters(learned.get_parameters(), device=model.device)  # type: ignore[arg-type]
+        for name in model._get_torch_save_params()[1]:
+            # A temperature may be fixed, and then be None in some algorithms.
+            if isinstance(getattr(model, name), th.Tensor):
+                getattr(model, name).data.copy_(getattr(learned, name).data)
+        model._n_updates = learned._n_updates
+
+    def _count_timesteps(self) -> None:
+        path = self.folder / "journal"
+        if not path.exists():
+            return
+        journal = JournalReader(path)
+        while records := journal.read(1000):
+            self.model.num_timesteps = records[-1].num_timesteps
+        journal.close()
+
+    def _timed(self, sample_action: Callable[..., Any], weights: SharedWeights) -> Callable[..., Any]:
+        def timed(*args: Any, **kwargs: Any) -> Any:
+            start = time.perf_counter()
+            result = sample_action(*args, **kwargs)
+            self.decision_seconds.append(time.perf_counter() - start)
+            self.weight_ages.append(weights.age)
+            return result
+
+        return timed
+
+
+def _learned_elsewhere(gradient_steps: int, batch_size: int = 64) -> None:
+    """In place of the model's ``train``."""
+
+
+class _Supervisor(gym.Wrapper):
+    """Lets the trainer look at every primitive step, so that it can stop within an option."""
+
+    def __init__(self, env: gym.Env):
+        super().__init__(env)
+        self.check: Callable[[], None] | None = None
+        self.has_commanded = False
+
+    def step(self, action: Any) -> Any:
+        if self.check is not None:
+            self.check()
+        self.has_commanded = True
+        return self.env.step(action)
+
+
+class _JournalBuffer:
+    """Stands where the acting model has its replay buffer."""
+
+    def __init__(self, journal: JournalWriter, model: OffPolicyAlgorithm):
+        self._journal = journal
+        self._model = model
+
+    def add(self, obs: Any, next_obs: Any, action: Any, reward: Any, done: Any, infos: list[dict[str, Any]]) -> None:
+        kept: list[dict[str, Any]] = [
+            {key: info[key] for key in ("TimeLimit.truncated", "option") if key in info} for info in infos
+        ]
+        # Stable-Baselines3 hands over arrays of its own, except for the observations, which the next step writes over.
+        self._journal.add(Transition(_copy(obs), _copy(next_obs), action, reward, done, kept, self._model.num_timesteps))
+
+
+def _copy(obs: np.ndarray | dict[str, np.ndarray]) -> np.ndarray | dict[str, np.ndarray]:
+    return {key: value.copy() for key, value in obs.items()} if isinstance(obs, dict) else obs.copy()
+
+
+class _Link:
+    """The acting process's end of the line to the learner."""
+
+    def __init__(self, process: Any, report: Any, weights: SharedWeights, model: OffPolicyAlgorithm):
+        self.process = process
+        self.report = report
+        self.weights = weights
+        self.model = model
+        self.log: dict[str, float] = {}
+        self._failure: str | None = None
+
+    def wait_until_ready(self) -> None:
+        deadline = time.monotonic() + _START_SECONDS
+        while time.monotonic() < deadline:
+            if self.report.poll(0.1) and self._read() == "ready":
+                return
+            self.check()
+        raise LearnerError(f"the learner did not start within {_START_SECONDS:.0f} s")
+
+    def check(self) -> None:
+        """Raise if the learner has failed or gone."""
+        while self.report.poll(0) and self._read() is not None:
+            pass
+        if self._failure is None and self.process.exitcode is not None:
+            code = self.process.exitcode
+            how = f"was killed by signal {signal.Signals(-code).name}" if code < 0 else f"ended with code {code}"
+            self._failure = f"the learner {how}"
+        self.raise_if_failed()
+
+    def raise_if_failed(self) -> None:
+        if self._failure is not None:
+            raise LearnerError(
+                f"{self._failure}\nThe environment was stopped; all experience is in the journal: resume=True continues."
+            )
+
+    def join(self) -> None:
+        self.process.join(_STOP_SECONDS)
+        if self.process.exitcode is None:
+            self.process.kill()
+            self.process.join()
+            self._failure = self._failure or f"the learner did not stop within {_STOP_SECONDS:.0f} s and was killed"
+        while self.report.poll(0) and self._read() is not None:
+            pass
+        self.report.close()
+
+    def _read(self) -> str | None:
+        try:
+            kind, content = self.report.recv()
+        except EOFError:
+            return None
+        if kind == "log":
+            self.log = content
+        elif kind == "failed":
+            self._failure = f"the learner failed:\n{content}"
+        return str(kind)
+
+
+class _AsynchronousCallback(BaseCallback):
+    """Picks weights up between decisions and hands the learner's log on."""
+
+    def __init__(self, trainer: AsynchronousTrainer, link: _Link):
+        super().__init__()
+        self.trainer = trainer
+        self.link = link
+
+    def _on_rollout_start(self) -> None:
+        self.link.weights.fetch(acting_module(self.link.model))
+
+    def _on_step(self) -> bool:
+        if self.link.log:
+            for name, value in self.link.log.items():
+                self.logger.record(name, value)
+            self.link.log = {}
+            self.logger.record("asynchronous/weights_version", self.link.weights.version)
+            self.logger.record("asynchronous/weights_age", self.link.weights.age)
+            if self.trainer.real_time is not None:
+                statistics = self.trainer.real_time.total_statistics
+                self.logger.record("real_time/ticks", statistics.ticks)
+                self.logger.record("real_time/late_ticks", statistics.late_ticks)
+                self.logger.record("real_time/worst_lateness", statistics.worst_lateness)
+        return True
+
+
+@contextmanager
+def _sigterm_as_exit() -> Iterator[None]:
+    """A SIGTERM ends the block by SystemExit, so that what follows it is done."""
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+
+    def leave(signum: int, frame: Any) -> None:
+        raise SystemExit(128 + signum)
+
+    before = signal.signal(signal.SIGTERM, leave)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGTERM, before)
+
+
+@contextmanager
+def _prompt_threads() -> Iterator[None]:
+    """Let threads take turns sooner than every 5 ms, Python's default and more than a period at 500 Hz."""
+    before = sys.getswitchinterval()
+    sys.setswitchinterval(5e-4)
+    try:
+        yield
+    finally:
+        sys.setswitchinterval(before)
+
+
+@contextmanager
+def _scheduled(priority: int | None) -> Iterator[None]:
+    """Run this thread, and those that it starts meanwhile, under the real-time scheduler."""
+    if priority is None:
+        yield
+        return
+    before = os.sched_getscheduler(0), os.sched_getparam(0)
+    try:
+        os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(priority))
+    except PermissionError:
+        raise PermissionError(
+            f"acting_priority={priority} needs root or CAP_SYS_NICE: grant it (sudo, or rtprio in /etc/security/limits.conf), "
+            "or pass None"
+        ) from None
+    try:
+        yield
+    finally:
+        os.sched_setscheduler(0, *before)

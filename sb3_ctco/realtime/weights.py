@@ -1,0 +1,83 @@
+"""A policy's weights in shared memory, with a version."""
+
+import ctypes
+import time
+from multiprocessing.context import BaseContext
+from typing import Any
+
+import numpy as np
+import torch as th
+from torch import nn
+
+
+class SharedWeights:
+    """Weights that one process publishes and another one picks up without waiting.
+
+    :param module: whose ``state_dict`` is shared; both sides have one of the same shapes
+    :param context: of multiprocessing, that starts the other process
+    """
+
+    def __init__(self, module: nn.Module, context: BaseContext):
+        n_bytes = sum(tensor.numel() * tensor.element_size() for tensor in module.state_dict().values())
+        self._memory = context.RawArray(ctypes.c_byte, n_bytes)
+        self._lock = context.Lock()
+        self._version = context.RawValue(ctypes.c_int64, 0)
+        self._published_at = context.RawValue(ctypes.c_double, time.monotonic())
+        self._seen = 0
+        self._seen_published_at = time.monotonic()
+
+    def publish(self, module: nn.Module) -> None:
+        """Put a module's weights in place of the last ones; a reader is waited for while it copies."""
+        flat = np.concatenate([_bytes_of(tensor) for tensor in module.state_dict().values()])
+        # Bounded, because a reader may have been killed while it held the lock.
+        if not self._lock.acquire(timeout=1.0):
+            return
+        try:
+            self._array()[:] = flat
+            self._version.value += 1
+            self._published_at.value = time.monotonic()
+        finally:
+            self._lock.release()
+
+    def fetch(self, module: nn.Module) -> bool:
+        """Copy the latest weights into a module, unless it has them or they are being written.
+
+        :return: whether they were copied
+        """
+        if self._version.value == self._seen or not self._lock.acquire(block=False):
+            return False
+        try:
+            flat = self._array().copy()
+            self._seen = self._version.value
+            self._seen_published_at = self._published_at.value
+        finally:
+            self._lock.release()
+        position = 0
+        with th.no_grad():
+            for tensor in module.state_dict().values():
+                n = tensor.numel() * tensor.element_size()
+                values = flat[position : position + n].view(_numpy_dtype(tensor))
+                tensor.copy_(th.from_numpy(values).view(tensor.shape))
+                position += n
+        return True
+
+    def _array(self) -> np.ndarray:
+        return np.frombuffer(memoryview(self._memory), dtype=np.uint8)
+
+    @property
+    def version(self) -> int:
+        """Of the weights fetched last; 0 for those that the process began with."""
+        return self._seen
+
+    @property
+    def age(self) -> float:
+        """Seconds since the weights fetched last were published."""
+        return time.monotonic() - self._seen_published_at
+
+
+def _bytes_of(tensor: th.Tensor) -> np.ndarray:
+    return tensor.detach().cpu().contiguous().numpy().reshape(-1).view(np.uint8)
+
+
+def _numpy_dtype(tensor: th.Tensor) -> Any:
+    return th.empty(0, dtype=tensor.dtype).numpy().dtype

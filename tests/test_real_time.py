@@ -1,0 +1,178 @@
+"""The real-time wrapper, by a clock that the test turns."""
+
+import logging
+import time
+
+import gymnasium as gym
+import numpy as np
+import pytest
+from gymnasium import spaces
+
+from sb3_ctco.wrappers import OptionExecutionWrapper, RealTimeWrapper
+
+
+class FakeClock:
+    """Time passes when somebody sleeps, and when the test says so."""
+
+    def __init__(self):
+        self.time = 100.0
+        self.slept = []
+
+    def now(self):
+        return self.time
+
+    def sleep(self, seconds):
+        self.slept.append(seconds)
+        self.time += seconds
+
+
+class Simulation(gym.Env):
+    """Each step takes the seconds that the script says; observations are the time."""
+
+    def __init__(self, clock, script=()):
+        self.clock = clock
+        self.script = list(script)
+        self.commands = []
+        self.dt = 0.25
+        self.observation_space = spaces.Box(-np.inf, np.inf, (1,), np.float64)
+        self.action_space = spaces.Box(-1, 1, (1,), np.float32)
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        return np.array([self.clock.now()]), {"scripted": True}
+
+    def step(self, action):
+        self.commands.append(self.clock.now())
+        self.clock.time += self.script.pop(0) if self.script else 0.0
+        return np.array([self.clock.now()]), 1.0, False, False, {"scripted": True}
+
+
+class Robot(Simulation):
+    """A machine that is read after the period."""
+
+    def step(self, action):
+        raise AssertionError("a machine is commanded by send and read by receive")
+
+    def send(self, action):
+        self.commands.append(self.clock.now())
+
+    def receive(self):
+        return np.array([self.clock.now()]), 1.0, False, False, {}
+
+
+def test_commands_keep_the_period_whatever_a_step_takes():
+    clock = FakeClock()
+    env = RealTimeWrapper(Simulation(clock, [0.0, 0.125, 0.25, 0.0]), clock=clock)
+    env.reset()
+    clock.time += 5.0  # whatever happens before the first command is nobody's delay
+    for _ in range(4):
+        env.step(np.zeros(1))
+    assert env.env.commands == [105.0, 105.25, 105.5, 105.75]
+    assert clock.slept == [0.25, 0.125, 0.25]
+    assert (env.statistics.ticks, env.statistics.late_ticks, env.statistics.worst_lateness) == (3, 0, 0.0)
+
+
+def test_late_tick_is_counted_and_the_next_ones_keep_their_times():
+    clock = FakeClock()
+    env = RealTimeWrapper(Simulation(clock), clock=clock)
+    env.reset()
+    env.step(np.zeros(1))
+    clock.time += 0.125  # a slow decision
+    _, _, _, _, info = env.step(np.zeros(1))
+    assert info == {"scripted": True, "real_time": {"lateness": 0.125}}
+    _, _, _, _, info = env.step(np.zeros(1))
+    assert info["real_time"]["lateness"] == 0.0
+    assert env.env.commands == [100.0, 100.375, 100.5]
+    s = env.statistics
+    assert (s.ticks, s.late_ticks, s.worst_lateness, s.total_lateness) == (2, 1, 0.125, 0.125)
+
+
+def test_lost_periods_are_not_made_up_for():
+    clock = FakeClock()
+    env = RealTimeWrapper(Simulation(clock, [1.0, 0.0, 0.0]), clock=clock)
+    env.reset()
+    for _ in range(3):
+        env.step(np.zeros(1))
+    # The second command was due at 100.25 and comes at 101; the third a full period later.
+    assert env.env.commands == [100.0, 101.0, 101.25]
+    assert (env.statistics.late_ticks, env.statistics.worst_lateness) == (1, 0.75)
+
+
+def test_tolerance():
+    clock = FakeClock()
+    env = RealTimeWrapper(Simulation(clock), clock=clock, tolerance=0.0625)
+    env.reset()
+    for delay in (0.0, 0.0625, 0.125):
+        clock.time += delay
+        env.step(np.zeros(1))
+    assert (env.statistics.ticks, env.statistics.late_ticks) == (2, 1)
+
+
+def test_machine_is_read_at_the_end_of_the_period():
+    clock = FakeClock()
+    env = RealTimeWrapper(Robot(clock), clock=clock)
+    env.reset()
+    obs = [float(env.step(np.zeros(1))[0][0]) for _ in range(3)]
+    assert env.env.commands == [100.0, 100.25, 100.5]
+    assert obs == [100.25, 100.5, 100.75]
+
+
+def test_statistics_of_an_episode_and_of_all(caplog):
+    clock = FakeClock()
+    env = RealTimeWrapper(Simulation(clock), clock=clock)
+    with caplog.at_level(logging.WARNING, logger="sb3_ctco.wrappers.real_time"):
+        for delay in (0.125, 0.0, 0.0625):
+            env.reset()
+            env.step(np.zeros(1))
+            clock.time += delay
+            env.step(np.zeros(1))
+        assert env.statistics.late_ticks == 1
+        assert env.total_statistics.late_ticks == 2
+        assert env.total_statistics.ticks == 3
+        env.close()
+    messages = [record.getMessage() for record in caplog.records]
+    assert len(messages) == 2
+    assert messages[0].startswith("1 of 1 ticks were late by more than 1.0 ms: by 125.0 ms on average")
+    assert "62.5 ms at worst (period 250.0 ms)" in messages[1]
+
+
+def test_under_options_every_primitive_step_is_timed():
+    clock = FakeClock()
+    env = OptionExecutionWrapper(RealTimeWrapper(Simulation(clock), clock=clock), n_rbf=1, d_max=1.0)
+    env.reset()
+    env.step(np.ones(2))
+    assert env.unwrapped.commands == [100.0, 100.25, 100.5, 100.75]
+    assert clock.now() == 101.0
+
+
+def test_wall_clock():
+    simulation = Simulation(FakeClock())
+    env = RealTimeWrapper(simulation, dt=0.01)
+    env.reset()
+    start = time.monotonic()
+    for _ in range(20):
+        env.step(np.zeros(1))
+    assert 0.2 <= time.monotonic() - start < 1.0
+
+
+@pytest.mark.parametrize(
+    ("kwargs", "message"),
+    [({"dt": 0.0}, "positive number of seconds, not 0.0"), ({"tolerance": -1.0}, "at least 0, not -1.0")],
+)
+def test_errors(kwargs, message):
+    with pytest.raises(ValueError, match=message):
+        RealTimeWrapper(Simulation(FakeClock()), **kwargs)
+
+
+def test_an_environment_without_a_period_is_refused():
+    env = Simulation(FakeClock())
+    del env.dt
+    with pytest.raises(ValueError, match="pass dt, in seconds, to RealTimeWrapper"):
+        RealTimeWrapper(env)
+
+
+def test_options_in_real_time_have_no_sub_options(scripted_env):
+    from sb3_ctco.wrappers import RealTimeOptionWrapper
+
+    with pytest.raises(ValueError, match="n_sub_options=4"):
+        RealTimeOptionWrapper(scripted_env(), n_sub_options=4)

@@ -1,0 +1,167 @@
+"""Hold an environment to the wall clock."""
+
+import logging
+import math
+import time
+from dataclasses import dataclass
+from typing import Any, Protocol, SupportsFloat, runtime_checkable
+
+import gymnasium as gym
+from gymnasium.utils import RecordConstructorArgs
+
+from sb3_ctco.wrappers.option_execution import find_dt
+
+logger = logging.getLogger(__name__)
+
+
+class Clock(Protocol):
+    """What a real-time loop needs of time; a fake one makes tests exact."""
+
+    def now(self) -> float:
+        """Time that never goes backwards, in s."""
+
+    def sleep(self, seconds: float) -> None:
+        """Wait."""
+
+
+class WallClock:
+    """The machine's monotonic clock."""
+
+    def now(self) -> float:
+        """Time that never goes backwards, in s."""
+        return time.monotonic()
+
+    def sleep(self, seconds: float) -> None:
+        """Wait."""
+        time.sleep(seconds)
+
+
+@runtime_checkable
+class SupportsSendReceive(Protocol):
+    """A machine that takes a command and is read later: ``step`` in two halves, with the control period in between."""
+
+    def send(self, action: Any) -> None:
+        """Put a command into force; return at once."""
+
+    def receive(self) -> tuple[Any, SupportsFloat, bool, bool, dict[str, Any]]:
+        """Read the sensors: what ``step`` returns."""
+
+
+@dataclass
+class TickStatistics:
+    """How well the period was kept.
+
+    :param ticks: commands that had a time to be sent at (all but the first of each episode)
+    :param late_ticks: those that were sent later than that by more than the tolerance
+    :param worst_lateness: of any tick, in s
+    :param total_lateness: of the late ticks, in s
+    """
+
+    ticks: int = 0
+    late_ticks: int = 0
+    worst_lateness: float = 0.0
+    total_lateness: float = 0.0
+
+    def add(self, lateness: float, tolerance: float) -> None:
+        """Account for a tick that was late by so many seconds."""
+        self.ticks += 1
+        self.worst_lateness = max(self.worst_lateness, lateness)
+        if lateness > tolerance:
+            self.late_ticks += 1
+            self.total_lateness += lateness
+
+
+class RealTimeWrapper(gym.Wrapper, RecordConstructorArgs):
+    """Hold the period: the k-th command of an episode is sent k·dt after the first one, by the wall clock.
+
+    ``step`` sends the command, waits for the end of the period, and returns what is observed then. A robot's
+    environment offers ``send`` and ``receive`` (:class:`SupportsSendReceive`), between which the wait takes place; for
+    any other one, a simulation, the wait follows its ``step``. Put it directly around that environment, inside
+    ``TimeLimit``, ``Monitor`` and ``OptionExecutionWrapper``.
+
+    A command is late if whoever decides, or the machine, took too long. Late ticks are counted in ``statistics`` (of
+    this episode) and ``total_statistics``, shown as ``info["real_time"]`` (``lateness`` of this step's command in s)
+    and logged as one warning an episode. The following commands keep their times, unless a whole period was lost:
+    then the clock starts anew, because commands in quick succession do a machine no good.
+
+    :param env: the environment
+    :param dt: the period, in s; by default what :func:`~sb3_ctco.wrappers.find_dt` finds
+    :param clock: :class:`WallClock` by default
+    :param tolerance: how late a command may be, in s, before it counts
+    :raises ValueError: if dt is not given and not found, or a number is out of range
+    """
+
+    def __init__(self, env: gym.Env, dt: float | None = None, clock: Clock | None = None, tolerance: float = 1e-3):
+        RecordConstructorArgs.__init__(self, dt=dt, clock=clock, tolerance=tolerance, _disable_deepcopy=True)
+        gym.Wrapper.__init__(self, env)
+        if dt is None:
+            dt = find_dt(env)
+        if dt is None:
+            raise ValueError(
+                f"{env} does not tell its interaction period (no unwrapped.dt, control_timestep() or "
+                "metadata['render_fps']): pass dt, in seconds, to RealTimeWrapper"
+            )
+        if not (dt > 0 and math.isfinite(dt)):
+            raise ValueError(f"dt must be a positive number of seconds, not {dt}")
+        if not tolerance >= 0:
+            raise ValueError(f"tolerance must be a number of seconds that is at least 0, not {tolerance}")
+        #: Period, in s
+        self.dt = float(dt)
+        self.tolerance = float(tolerance)
+        self.clock: Clock = WallClock() if clock is None else clock
+        self.statistics = TickStatistics()
+        self.total_statistics = TickStatistics()
+        self._due: float | None = None
+
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
+        """Reset the environment; the clock starts with the first command."""
+        self._log()
+        self.statistics = TickStatistics()
+        self._due = None
+        return self.env.reset(seed=seed, options=options)
+
+    def step(self, action: Any) -> tuple[Any, SupportsFloat, bool, bool, dict[str, Any]]:
+        """Send a command and return what is observed one period later."""
+        now = self.clock.now()
+        if self._due is None:
+            self._due, lateness = now, 0.0
+        else:
+            lateness = max(0.0, now - self._due)
+            self.statistics.add(lateness, self.tolerance)
+            self.total_statistics.add(lateness, self.tolerance)
+        # Whole periods that were lost are not made up for.
+        self._due = (now if lateness >= self.dt else self._due) + self.dt
+
+        if isinstance(self.env, SupportsSendReceive):
+            self.env.send(action)
+            self._wait()
+            obs, reward, terminated, truncated, info = self.env.receive()
+        else:
+            obs, reward, terminated, truncated, info = self.env.step(action)
+            self._wait()
+        return obs, reward, terminated, truncated, {**info, "real_time": {"lateness": lateness}}
+
+    def close(self) -> None:
+        """Log the last episode's late ticks and close the environment."""
+        self._log()
+        self.statistics = TickStatistics()
+        super().close()
+
+    def _wait(self) -> None:
+        assert self._due is not None
+        remaining = self._due - self.clock.now()
+        if remaining > 0:
+            self.clock.sleep(remaining)
+
+    def _log(self) -> None:
+        s = self.statistics
+        if s.late_ticks:
+            logger.warning(
+                "%d of %d ticks were late by more than %.1f ms: by %.1f ms on average, %.1f ms at worst (period %.1f ms)",
+                s.late_ticks,
+                s.ticks,
+                1e3 * self.tolerance,
+                1e3 * s.total_lateness / s.late_ticks,
+                1e3 * s.worst_lateness,
+                1e3 * self.dt,
+            )

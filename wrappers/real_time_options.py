@@ -1,0 +1,157 @@
+"""Options on a machine that does not wait: decided ahead of time, and interrupted when the world changes."""
+
+from collections.abc import Callable
+from concurrent.futures import Future, ThreadPoolExecutor
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+from gymnasium.error import ResetNeeded
+from gymnasium.utils import RecordConstructorArgs
+
+from sb3_ctco.wrappers.option_execution import OptionExecutionWrapper, SequenceResult, StepSequence
+
+#: ``interrupt(observation of the last decision, observation, seconds since that one)``: whether to end the option
+Interrupt = Callable[[Any, Any, float], bool]
+
+
+class RealTimeOptionWrapper(OptionExecutionWrapper):
+    """An :class:`OptionExecutionWrapper` that hides the policy's latency, and that can break an option off.
+
+    With ``decide_ahead``, a ``step`` returns that long before its option ends, and the rest of the option plays while
+    the next one is decided on: in a thread of its own with ``background``, otherwise at the beginning of the next
+    ``step``, which is the same to a simulation. A transition is what happened between two decisions: the rest of the
+    option before, then the new one without its rest. Its duration and rewards are exactly those of that time, so
+    nothing is counted twice or late; but the state at a decision does not tell which rest is still to play. The policy
+    sees the state of ``decide_ahead`` seconds before its option begins, and the process is a semi-Markov process only
+    as far as that does not matter. The first option of an episode begins at once.
+
+    With ``interrupt``, a function that is called after each primitive step, an option ends as soon as it says so; the
+    transition has the time that ran.
+
+    :param env: the environment to wrap
+    :param decide_ahead: in s; rounded to whole steps
+    :param interrupt: called as ``interrupt(observation of the last decision, observation, seconds since that one)``
+    :param background: whether the rest of an option plays in a thread of its own, which is for environments that the
+        wall clock governs and that may be stepped from another thread (one that renders may not)
+    :param kwargs: see :class:`OptionExecutionWrapper`
+    :raises ValueError: if ``decide_ahead`` is negative or not shorter than the longest option, or for sub-options
+    """
+
+    def __init__(
+        self,
+        env: gym.Env,
+        decide_ahead: float = 0.0,
+        interrupt: Interrupt | None = None,
+        background: bool = False,
+        **kwargs: Any,
+    ):
+        RecordConstructorArgs.__init__(
+            self, decide_ahead=decide_ahead, interrupt=interrupt, background=background, _disable_deepcopy=True, **kwargs
+        )
+        super().__init__(env, **kwargs)
+        if self.n_sub_options:
+            raise ValueError(
+                f"n_sub_options={self.n_sub_options} is not possible in real time, where a transition may consist of parts of "
+                "two options: pass n_sub_options=0"
+            )
+        if not 0.0 <= decide_ahead < self.option_settings.d_max:
+            raise ValueError(
+                f"decide_ahead must be at least 0 s and less than d_max={self.option_settings.d_max} s, not {decide_ahead}"
+            )
+        self.interrupt = interrupt
+        self._ahead_steps = round(decide_ahead / self.option_settings.dt)
+        self._executor = ThreadPoolExecutor(1, thread_name_prefix="option") if background else None
+        self._rest: np.ndarray | None = None
+        self._playing_rest: Future[SequenceResult] | None = None
+        self._abandoned = False
+        self._decided_on: Any = None
+        self._play: StepSequence | None = None
+
+    @classmethod
+    def like(
+        cls, wrapper: OptionExecutionWrapper, decide_ahead: float, interrupt: Interrupt | None, background: bool
+    ) -> "RealTimeOptionWrapper":
+        """The same wrapper around the same environment, with what this class adds."""
+        settings = wrapper.option_settings
+        return cls(
+            wrapper.env,
+            decide_ahead,
+            interrupt,
+            background,
+            n_rbf=settings.n_rbf,
+            d_max=settings.d_max,
+            d_min=settings.d_min,
+            dt=settings.dt,
+            discount_rate=settings.discount_rate,
+            reward=wrapper.reward,
+            reward_unit=wrapper.reward_unit,
+            n_sub_options=wrapper.n_sub_options,
+        )
+
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
+        """Reset the inner environment."""
+        self.abandon()
+        self._abandoned = False
+        obs, info = super().reset(seed=seed, options=options)
+        self._decided_on = obs
+        self._play = self._play_around_decisions
+        return obs, info
+
+    def abandon(self) -> None:
+        """Stop playing, at the next primitive step; needs a reset then."""
+        self._abandoned = True
+        self._play = None
+        self._rest = None
+        playing, self._playing_rest = self._playing_rest, None
+        if playing is not None:
+            playing.exception()  # waits, and whatever it raised is of no interest any more
+
+    def close(self) -> None:
+        """Stop playing and close the environment."""
+        self.abandon()
+        if self._executor is not None:
+            self._executor.shutdown()
+        super().close()
+
+    def _play_around_decisions(self, plan: np.ndarray) -> SequenceResult:
+        rest = self._finish_rest()
+        # Something must happen between two decisions.
+        n_now = max(len(plan) - self._ahead_steps, 0 if rest is not None else 1)
+        over = rest is not None and (rest[2] or rest[3] or rest[4].get("interrupted", False))
+        if rest is not None and (over or n_now == 0):
+            result = rest
+        else:
+            result = self._play_until_interrupted(plan[:n_now], 0 if rest is None else len(rest[1]))  # type: ignore[arg-type]
+            if rest is not None:
+                result = (result[0], [*rest[1], *result[1]], *result[2:])  # type: ignore[misc]
+            over = result[2] or result[3] or result[4].get("interrupted", False)
+        self._decided_on = result[0]
+        if not over and n_now < len(plan):
+            self._rest = plan[n_now:]
+            if self._executor is not None:
+                self._playing_rest = self._executor.submit(self._play_until_interrupted, self._rest)
+        return result
+
+    def _finish_rest(self) -> SequenceResult | None:
+        rest, self._rest = self._rest, None
+        playing, self._playing_rest = self._playing_rest, None
+        if playing is not None:
+            return playing.result()
+        return None if rest is None else self._play_until_interrupted(rest)
+
+    def _play_until_interrupted(self, actions: np.ndarray, steps_before: int = 0) -> SequenceResult:
+        rewards: list[Any] = []
+        for action in actions:
+            if self._abandoned:
+                raise ResetNeeded("playing was abandoned: call reset() first")
+            obs, reward, terminated, truncated, info = self.env.step(action)
+            rewards.append(reward)
+            if terminated or truncated:
+                break
+            if self.interrupt is not None and self.interrupt(
+                self._decided_on, obs, (steps_before + len(rewards)) * self.option_settings.dt
+            ):
+                info = {**info, "interrupted": True}
+                break
+        return obs, rewards, terminated, truncated, info
