@@ -17,6 +17,12 @@ from sb3_ctco.envs.visual_reacher.model import JOINT_LIMITS
 from sb3_ctco.wrappers import OptionExecutionWrapper, SupportsStepSequence, find_dt
 
 
+try:
+    VisualReacherEnv().close()
+except RuntimeError as error:  # it says what to install
+    pytest.skip(str(error), allow_module_level=True)
+
+
 @pytest.fixture
 def env():
     made = VisualReacherEnv()
