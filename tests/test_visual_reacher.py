@@ -16,7 +16,6 @@ from sb3_ctco.envs.visual_reacher.env import BAG_AREA, JOINT_MARGIN, START_POSE,
 from sb3_ctco.envs.visual_reacher.model import JOINT_LIMITS
 from sb3_ctco.wrappers import OptionExecutionWrapper, SupportsStepSequence, find_dt
 
-
 try:
     VisualReacherEnv().close()
 except RuntimeError as error:  # it says what to install
