@@ -17,7 +17,10 @@ PAGES = sorted(page for page in (ROOT / "docs").glob("*.md") if "```python" in p
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: page.stem)
 def test_snippets_run(page, tmp_path, monkeypatch):
-    """All Python blocks of a page, one after the other in one namespace, with short trainings."""
+    """All Python blocks of a page, one after the other in one namespace, with short trainings.
+
+    Blocks that are marked ``py`` need a machine.
+    """
     monkeypatch.chdir(tmp_path)
     for base in (OffPolicyAlgorithm, OnPolicyAlgorithm):
 
