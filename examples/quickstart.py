@@ -1,7 +1,7 @@
 """Train CTCO on a MuJoCo task at a high interaction frequency, and look at what it does.
 
 By default: the sparse point mass at 500 Hz. A mass must be pushed to a small target; the reward is 1 a second on the
-target and nothing anywhere else. About three minutes on two cores.
+target and nothing anywhere else. About two minutes on two cores.
 
     python examples/quickstart.py
     python examples/quickstart.py --task ball_in_cup --dt 0.02 --seconds 2400 --seed 1 --output runs/cup
@@ -46,7 +46,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--task", choices=TASKS, default="point_mass")
     parser.add_argument("--dt", type=float, default=0.002, help="interaction period, s (default: %(default)s)")
-    parser.add_argument("--seconds", type=float, default=1800.0, help="task time to train for, s (default: %(default)s)")
+    parser.add_argument("--seconds", type=float, default=1500.0, help="task time to train for, s (default: %(default)s)")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--output", type=Path, default=Path("runs/quickstart"), help="folder (default: %(default)s)")
     args = parser.parse_args()
@@ -68,13 +68,13 @@ def main() -> None:
         tau=0.01,
         updates_per_second=20,
         n_rbf=3,
+        n_sub_options=8,
         d_max=0.5,
-        high_freq_penalty=0.05,
+        high_freq_penalty=0.003,
         ent_coef="auto_0.02",
         duration_ent_coef="auto_0.02",
-        duration_learning_rate=1e-5,
         buffer_size=200_000,
-        policy_kwargs={"net_arch": {"pi": [10, 10], "qf": [64, 64]}},
+        policy_kwargs={"net_arch": {"pi": [64, 64], "qf": [128, 128]}},
         seed=args.seed,
     )
     steps = round(args.seconds / args.dt)
