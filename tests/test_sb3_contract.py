@@ -29,19 +29,20 @@ from stable_baselines3.common.torch_layers import BaseFeaturesExtractor, Flatten
 from stable_baselines3.common.vec_env import DummyVecEnv, VecFrameStack, VecNormalize
 from torch import nn
 
-from sb3_ctco import CTCO, OptionExecutionWrapper
+from sb3_ctco import CTCO, FiGARSAC, OptionExecutionWrapper
 
 #: Each algorithm with arguments that make its runs short.
-ALGORITHMS = {
-    CTCO: {
-        "learning_starts": 20,
-        "batch_size": 8,
-        "buffer_size": 300,
-        "d_max": 0.3,
-        "policy_kwargs": {"net_arch": [16]},
-        "device": "cpu",
-    }
+_SHORT = {
+    "learning_starts": 20,
+    "batch_size": 8,
+    "buffer_size": 300,
+    "d_max": 0.3,
+    "policy_kwargs": {"net_arch": [16]},
+    "device": "cpu",
 }
+ALGORITHMS = {CTCO: _SHORT, FiGARSAC: _SHORT}
+#: OptionExecutionWrapper's arguments for each
+WRAPPER: dict[type, dict[str, Any]] = {CTCO: {"d_max": 0.3}, FiGARSAC: {"n_rbf": 1, "d_max": 0.3}}
 pytestmark = pytest.mark.parametrize("algorithm", ALGORITHMS, ids=lambda algorithm: algorithm.__name__)
 
 
@@ -52,8 +53,8 @@ def make(algorithm: type, env: Any, policy: str = "MlpPolicy", **kwargs: Any) ->
     return algorithm(policy, env, **arguments)
 
 
-def wrapped(env: gym.Env) -> OptionExecutionWrapper:
-    return OptionExecutionWrapper(env, d_max=0.3)
+def wrapped(algorithm: type, env: gym.Env) -> OptionExecutionWrapper:
+    return OptionExecutionWrapper(env, **WRAPPER[algorithm])
 
 
 def copy_of_parameters(model: Any) -> "OrderedDict[str, th.Tensor]":
@@ -100,12 +101,16 @@ class StopsAt(BaseCallback):
         {"learning_rate": lambda remaining: 1e-3 * remaining},
         {"train_freq": (1, "episode"), "gradient_steps": 5},
         {"train_freq": 8, "gradient_steps": 2},
-        {"action_noise": NormalActionNoise(np.zeros(4), 0.1 * np.ones(4))},
+        {"action_noise": 0.1},
     ],
     ids=lambda kwargs: ", ".join(kwargs) or "defaults",
 )
 def test_runs(algorithm, random_walk_env, kwargs):
-    model = make(algorithm, random_walk_env(), **kwargs)
+    env = wrapped(algorithm, random_walk_env())
+    if "action_noise" in kwargs:
+        shape = env.action_space.shape
+        kwargs = {"action_noise": NormalActionNoise(np.zeros(shape), np.full(shape, kwargs["action_noise"]))}
+    model = make(algorithm, env, **kwargs)
     before = copy_of_parameters(model)
     model.learn(80)
     assert model.num_timesteps >= 80
@@ -116,7 +121,7 @@ def test_runs(algorithm, random_walk_env, kwargs):
 
 @pytest.mark.parametrize("n_envs", [1, 3])
 def test_several_environments(algorithm, random_walk_env, n_envs):
-    env = make_vec_env(random_walk_env, n_envs, wrapper_class=OptionExecutionWrapper, wrapper_kwargs={"d_max": 0.3})
+    env = make_vec_env(random_walk_env, n_envs, wrapper_class=OptionExecutionWrapper, wrapper_kwargs=WRAPPER[algorithm])
     model = make(algorithm, env).learn(120)
     assert model._n_updates > 0
     assert model.predict(env.reset())[0].shape == (n_envs, *env.action_space.shape)
@@ -330,7 +335,7 @@ def test_dictionaries(algorithm):
 
 def test_dictionaries_normalised_and_stacked(algorithm, tmp_path):
     # VecNormalize outside, as Stable-Baselines3 asks of algorithms with a replay buffer.
-    env = VecFrameStack(DummyVecEnv([lambda: wrapped(GoalWalk())] * 2), n_stack=3)
+    env = VecFrameStack(DummyVecEnv([lambda: wrapped(algorithm, GoalWalk())] * 2), n_stack=3)
     env = VecNormalize(env, norm_obs=True, norm_reward=False, norm_obs_keys=["goal"])
     model = make(algorithm, env, "MultiInputPolicy").learn(120)
     assert model.observation_space["position"].shape == (6,)
@@ -340,7 +345,7 @@ def test_dictionaries_normalised_and_stacked(algorithm, tmp_path):
 
     model.save(tmp_path / "model")
     normalizer.save(tmp_path / "normalize.pkl")
-    stacked = VecFrameStack(DummyVecEnv([lambda: wrapped(GoalWalk())]), n_stack=3)
+    stacked = VecFrameStack(DummyVecEnv([lambda: wrapped(algorithm, GoalWalk())]), n_stack=3)
     again = VecNormalize.load(tmp_path / "normalize.pkl", stacked)
     loaded = algorithm.load(tmp_path / "model", env=again, device="cpu")
     evaluate_policy(loaded, loaded.get_env(), 2, warn=False)
@@ -348,14 +353,14 @@ def test_dictionaries_normalised_and_stacked(algorithm, tmp_path):
 
 
 def test_images_stacked(algorithm, random_walk_env):
-    env = VecFrameStack(DummyVecEnv([lambda: wrapped(random_walk_env("image"))]), n_stack=2, channels_order="first")
+    env = VecFrameStack(DummyVecEnv([lambda: wrapped(algorithm, random_walk_env("image"))]), n_stack=2, channels_order="first")
     kwargs = {"features_extractor_class": TinyCnn}
     model = make(algorithm, env, "CnnPolicy", buffer_size=100, policy_kwargs=kwargs).learn(40)
     assert model.observation_space.shape == (6, 36, 36)
 
 
 def test_vec_normalize_of_observations(algorithm, random_walk_env):
-    env = VecNormalize(DummyVecEnv([lambda: wrapped(random_walk_env())]), norm_reward=False)
+    env = VecNormalize(DummyVecEnv([lambda: wrapped(algorithm, random_walk_env())]), norm_reward=False)
     model = make(algorithm, env).learn(80)
     # The buffer keeps observations as they are, and normalises what it samples.
     stored = model.replay_buffer.observations[: model.replay_buffer.pos]
@@ -388,7 +393,10 @@ def test_train_and_eval_mode(algorithm, random_walk_env):
 
     # Training moves them, those of the critics and, at once, those of the targets.
     model.learn(60)
-    for network, target in ((model.actor, model.actor_target), (model.critic, model.critic_target)):
+    pairs = [(model.critic, model.critic_target)]
+    if hasattr(model, "actor_target"):  # FiGAR-SAC has none
+        pairs.append((model.actor, model.actor_target))
+    for network, target in pairs:
         running = network.features_extractor.norm.running_mean
         assert not th.equal(running, statistics)
         assert th.equal(running, target.features_extractor.norm.running_mean)
@@ -417,7 +425,7 @@ def test_callbacks(algorithm, tmp_path, random_walk_env):
 
     checkpoint = CheckpointCallback(20, str(tmp_path), save_replay_buffer=True)
     evaluation = EvalCallback(
-        wrapped(random_walk_env()),
+        wrapped(algorithm, random_walk_env()),
         callback_on_new_best=StopTrainingOnRewardThreshold(reward_threshold=-1e9),
         eval_freq=50,
         n_eval_episodes=1,
