@@ -125,9 +125,11 @@ def fit_weights(plan: FloatArray, n_rbf: int) -> tuple[FloatArray, float]:
     :return: ω, shape ``[action_dim, n_rbf]``, and the residual, the largest deviation of an action from the plan
     """
     n_steps = len(plan)
-    omega = (_pseudo_inverse(n_steps, n_rbf) @ plan).clip(-1.0, 1.0)
-    residual = float(np.abs(basis_of_steps(n_steps, n_rbf) @ omega - plan).max())
-    return omega.T, residual
+    # About the plan's mean, which equal weights give exactly: where few steps leave weights open, they stay near it.
+    mean = plan.mean(axis=0)
+    omega = (mean + _pseudo_inverse(n_steps, n_rbf) @ (plan - mean)).clip(-1.0, 1.0)
+    deviation = basis_of_steps(n_steps, n_rbf) @ omega - plan
+    return omega.T, max(float(deviation.max()), -float(deviation.min()))
 
 
 def primitive_actions(trajectory: FloatArray, low: npt.NDArray[Any], high: npt.NDArray[Any]) -> npt.NDArray[Any]:
@@ -212,16 +214,19 @@ class OptionSettings:
         """The duration d that an option vector asks for, in s: its last entry, mapped from [−1, 1] to [d_min, d_max]."""
         return self.d_min + 0.5 * (float(option[-1]) + 1.0) * (self.d_max - self.d_min)
 
-    def encode(self, omega: FloatArray, n_steps: int) -> FloatArray:
-        """The option vector that :meth:`decode` turns into these; d_min = d_max is encoded as 0.
+    def encode(self, omega: FloatArray, n_steps: npt.NDArray[np.integer]) -> FloatArray:
+        """The option vectors that :meth:`decode` turns into these; d is encoded as 0 if d_min = d_max.
 
-        :param omega: shape ``[action_dim, n_rbf]``
-        :param n_steps: number of primitive steps
-        :return: shape ``[action_dim · n_rbf + 1]``, float32
+        :param omega: weights, flattened, shape ``[n, action_dim · n_rbf]``
+        :param n_steps: numbers of primitive steps, shape ``[n]``
+        :return: shape ``[n, action_dim · n_rbf + 1]``, float32
         """
         width = self.d_max - self.d_min
-        entry = 2.0 * (n_steps * self.dt - self.d_min) / width - 1.0 if width > 0 else 0.0
-        return np.append(omega, min(max(entry, -1.0), 1.0)).astype(np.float32)
+        options = np.zeros((len(omega), omega.shape[1] + 1), dtype=np.float32)
+        options[:, :-1] = omega
+        if width > 0:
+            options[:, -1] = (2.0 * (n_steps * self.dt - self.d_min) / width - 1.0).clip(-1.0, 1.0)
+        return options
 
     def decode(self, option: FloatArray) -> tuple[FloatArray, int]:
         """Split an option vector.

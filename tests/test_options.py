@@ -220,9 +220,11 @@ def test_a_fit_is_the_least_squares_one_and_says_how_far_off_it_is():
 def test_encode_is_the_inverse_of_decode():
     settings = OptionSettings(n_rbf=2, d_max=1.0, d_min=0.1, dt=0.1, discount_rate=0.4)
     omega = np.array([[0.1, 0.2], [-0.3, 0.4]])
-    for n_steps in range(1, 11):
-        again, steps = settings.decode(settings.encode(omega, n_steps))
+    options = settings.encode(np.tile(omega.ravel(), (10, 1)), np.arange(1, 11))
+    assert options.dtype == np.float32
+    for n_steps, option in enumerate(options, start=1):
+        again, steps = settings.decode(option)
         np.testing.assert_allclose(again, omega, rtol=1e-6)
         assert steps == n_steps
     fixed = OptionSettings(n_rbf=2, d_max=0.3, d_min=0.3, dt=0.1, discount_rate=0.4)
-    assert fixed.decode(fixed.encode(omega, 3))[1] == 3
+    assert fixed.decode(fixed.encode(omega.reshape(1, -1), np.array([3]))[0])[1] == 3

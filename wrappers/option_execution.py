@@ -315,7 +315,7 @@ class OptionExecutionWrapper(gym.Wrapper, RecordConstructorArgs):
     ) -> SubOptions:
         """Make transitions of the slices; at the episode's end they end with it, or are dropped."""
         settings, n_ran = self.option_settings, len(rewards)
-        kept, options, residuals = [], [], []
+        kept, weights, residuals = [], [], []
         for first, last in slices:
             end = min(last, n_ran)
             # Both are the same where the episode's end has cut off too much.
@@ -324,7 +324,7 @@ class OptionExecutionWrapper(gym.Wrapper, RecordConstructorArgs):
             omega, residual = fit_weights(trajectory[first:end], settings.n_rbf)
             if residual <= self.sub_option_tolerance:
                 kept.append((first, end))
-                options.append(settings.encode(omega, end - first))
+                weights.append(omega)
                 residuals.append(residual)
         ends = np.array(kept, dtype=np.int64).reshape(-1, 2)
         # R of a stretch from the discounted rewards up to its ends
@@ -336,7 +336,7 @@ class OptionExecutionWrapper(gym.Wrapper, RecordConstructorArgs):
         return SubOptions(
             observations=[observations[first] for first, _ in kept],
             next_observations=[observations[end] for _, end in kept],
-            options=np.array(options, dtype=np.float32).reshape(len(kept), *self.action_space.shape),
+            options=settings.encode(np.array(weights).reshape(len(kept), self.action_space.shape[0] - 1), ends[:, 1] - ends[:, 0]),
             durations=(ends[:, 1] - ends[:, 0]) * settings.dt,
             integrated_rewards=integrals,
             terminated=at_end & terminated,
