@@ -79,7 +79,7 @@ def run(args: argparse.Namespace) -> None:
         seed=args.seed,
         learning_starts=round(LEARNING_STARTS / dt),
         buffer_size=200_000,
-        **SETTINGS[args.setting],
+        **{**SETTINGS[args.setting], **args.override},
     )
     callback = DiscountedReturnCallback(model.discount_rate)
     start = time.time()
@@ -90,6 +90,7 @@ def run(args: argparse.Namespace) -> None:
     last_tenth = [e for e, n in zip(callback.episodes, callback.timesteps, strict=True) if n * dt > 0.9 * args.seconds]
     summary = {
         "setting": args.setting,
+        "override": args.override,
         "task": args.task,
         "rate": args.rate,
         "seed": args.seed,
@@ -158,6 +159,7 @@ def main() -> None:
     one.add_argument("--rate", type=int, required=True, help="interaction frequency, Hz")
     one.add_argument("--seed", type=int, default=0)
     one.add_argument("--setting", choices=SETTINGS, default="paper")
+    one.add_argument("--override", type=json.loads, default={}, help='JSON, e.g. {"d_max": 1.0}; use a --folder of its own')
     one.add_argument("--seconds", type=float, default=2400.0, help="task time")
     one.add_argument("--folder", default="runs/learning")
     one.add_argument("--progress", action="store_true")

@@ -336,7 +336,9 @@ class OptionExecutionWrapper(gym.Wrapper, RecordConstructorArgs):
         return SubOptions(
             observations=[observations[first] for first, _ in kept],
             next_observations=[observations[end] for _, end in kept],
-            options=settings.encode(np.array(weights).reshape(len(kept), self.action_space.shape[0] - 1), ends[:, 1] - ends[:, 0]),
+            options=settings.encode(
+                np.array(weights).reshape(len(kept), self.action_space.shape[0] - 1), ends[:, 1] - ends[:, 0]
+            ),
             durations=(ends[:, 1] - ends[:, 0]) * settings.dt,
             integrated_rewards=integrals,
             terminated=at_end & terminated,
