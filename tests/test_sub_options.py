@@ -133,6 +133,32 @@ def test_bad_arguments(scripted_env, kwargs, message):
         wrap(scripted_env(), **kwargs)
 
 
+def test_an_observation_on_the_way_that_is_not_finite_is_refused(scripted_env):
+    class Env(scripted_env):
+        def _obs(self):
+            # Every observation within an option of 15 steps, but neither its first nor its last one
+            return super()._obs() * (np.nan if 0 < self.count < 15 else 1.0)
+
+    env = wrap(Env())
+    env.reset(seed=0)
+    with pytest.raises(ValueError, match="observation that is not finite"):
+        env.step(np.append(np.zeros(3), 1.0))
+    # Without sub-options nobody sees them.
+    env = wrap(Env(), n_sub_options=0)
+    env.reset(seed=0)
+    env.step(np.append(np.zeros(3), 1.0))
+
+
+def test_an_environments_own_infos_stay(scripted_env):
+    class Env(scripted_env):
+        def step(self, action):
+            return *super().step(action)[:4], {"observations": "its own"}
+
+    env = wrap(Env(), n_sub_options=0)
+    env.reset(seed=0)
+    assert env.step(np.append(np.zeros(3), 1.0))[4]["observations"] == "its own"
+
+
 def test_they_change_nothing_in_what_the_environment_does():
     def outcome(n):
         env = OptionExecutionWrapper(Monitor(gym.make("sb3_ctco/ball_in_cup-catch-v0", dt=0.01)), n_sub_options=n)

@@ -255,12 +255,15 @@ class OptionExecutionWrapper(gym.Wrapper, RecordConstructorArgs):
         observe = sorted({k for ends in slices for k in ends} - {0, n_steps})
         actions = self._primitive(trajectory)
         obs, rewards, terminated, truncated, info = play(actions, observe) if observe else play(actions)
+        observations = info.pop("observations", []) if observe else []
 
         rewards = np.asarray(rewards, dtype=np.float64)
         if not np.isfinite(rewards).all():
             raise ValueError(f"the environment {self.env} returned a reward that is not finite: {rewards}")
-        if self._checks_observation and not np.isfinite(obs).all():
-            raise ValueError(f"the environment {self.env} returned an observation that is not finite: {obs}")
+        if self._checks_observation:
+            for seen_obs in (*observations, obs):
+                if not np.isfinite(seen_obs).all():
+                    raise ValueError(f"the environment {self.env} returned an observation that is not finite: {seen_obs}")
         if not (terminated or truncated):
             self._play = play
 
@@ -273,7 +276,6 @@ class OptionExecutionWrapper(gym.Wrapper, RecordConstructorArgs):
             "integrated_reward": integral,
             "discount": float(discount(duration, settings.discount_rate)),
         }
-        observations = info.pop("observations", [])
         if self.n_sub_options:
             last_obs = deepcopy(obs)  # which the environment may overwrite
             seen = dict(zip(observe, observations, strict=False)) | {0: self._last_obs, len(rewards): last_obs}
