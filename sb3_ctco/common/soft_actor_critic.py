@@ -162,31 +162,10 @@ class SoftOptionActorCritic(OptionOffPolicyAlgorithm):
             optimizers.append(self.ent_coef_optimizer)
         self._update_learning_rate(optimizers)
 
-        actor_parameters = list(self.actor.parameters())
         losses = []
         for _ in range(gradient_steps):
             data = self.replay_buffer.sample(batch_size, env=self._vec_normalize_env)
-
-            sample = self._sample_policy(data.observations)
-            ent_coef_loss = self._update_temperatures(sample[1].detach())
-
-            with th.no_grad():
-                targets = self._critic_targets(data)
-            q_loss = critic_loss(self._q_values(data), targets)
-            self.critic.optimizer.zero_grad()
-            q_loss.backward()
-            self.critic.optimizer.step()
-
-            pi_loss = self._actor_loss(data.observations, sample)
-            self.actor.optimizer.zero_grad()
-            pi_loss.backward(inputs=actor_parameters)  # and no gradients for the critics
-            self.actor.optimizer.step()
-
-            with th.no_grad():
-                # Stable-Baselines3's polyak_update of all parameters in one call
-                th._foreach_lerp_(self._target_parameters, self._source_parameters, self.tau)
-            polyak_update(self._batch_norm_stats, self._batch_norm_stats_target, 1.0)
-            losses.append(th.stack((pi_loss.detach(), q_loss.detach(), ent_coef_loss)))
+            losses.append(self._update(data))
 
         self._n_updates += gradient_steps
         # Read once, because each reading waits for the device.
@@ -205,21 +184,58 @@ class SoftOptionActorCritic(OptionOffPolicyAlgorithm):
         """Both temperatures, of what to do and of the duration, ``[2]``, without gradients."""
         return self.log_ent_coefs.detach().exp()
 
+    def _update(self, data: ReplayBufferSamples) -> th.Tensor:
+        """One update of temperatures, critics, actor and targets.
+
+        :return: the losses of actor, critics and temperatures, ``[3]``
+        """
+        sample = self._sample_policy(data.observations)
+        ent_coef_loss = self._update_temperatures(sample[1].detach())
+
+        with th.no_grad():
+            targets = self._critic_targets(data)
+        q_loss = critic_loss(self._q_values(data), targets)
+        self.critic.optimizer.zero_grad()
+        q_loss.backward()
+        self.critic.optimizer.step()
+
+        pi_loss = self._actor_loss(data.observations, sample)
+        self.actor.optimizer.zero_grad()
+        pi_loss.backward(inputs=[p for p in self.actor.parameters() if p.requires_grad])  # and no gradients for the critics
+        self.actor.optimizer.step()
+
+        self._update_targets()
+        return th.stack((pi_loss.detach(), q_loss.detach(), ent_coef_loss))
+
     def _update_temperatures(self, log_prob: th.Tensor) -> th.Tensor:
-        """SAC's dual ascent on both temperatures; those that are fixed get no gradient.
+        """SAC's dual ascent on both temperatures.
 
         :param log_prob: ``[batch, 2]``, over the normalised box
         :return: the loss
         """
         if self.ent_coef_optimizer is None:
             return th.zeros((), device=self.device)
+        # The loss is linear in the logarithms, so its gradient needs no backward pass.
+        self.log_ent_coefs.grad, loss = self._temperature_gradient(log_prob)
+        self.ent_coef_optimizer.step()
+        return loss
+
+    def _temperature_gradient(self, log_prob: th.Tensor) -> tuple[th.Tensor, th.Tensor]:
+        """The gradient of the temperatures' loss by their logarithms; zero for a temperature that is fixed.
+
+        :param log_prob: ``[batch, 2]``, over the normalised box
+        :return: the gradient, ``[2]``, and the loss
+        """
         excess = th.where(self._ent_coef_learned, log_prob.mean(dim=0) + self._target_entropies, 0.0)
         # A temperature of zero is fixed and has no finite logarithm.
         loss = -(th.where(self._ent_coef_learned, self.log_ent_coefs.detach(), 0.0) * excess).sum()
-        # The loss is linear in the logarithms, so its gradient needs no backward pass.
-        self.log_ent_coefs.grad = -excess
-        self.ent_coef_optimizer.step()
-        return loss
+        return -excess, loss
+
+    def _update_targets(self) -> None:
+        with th.no_grad():
+            # Stable-Baselines3's polyak_update of all parameters in one call
+            th._foreach_lerp_(self._target_parameters, self._source_parameters, self.tau)
+        polyak_update(self._batch_norm_stats, self._batch_norm_stats_target, 1.0)
 
     def _excluded_save_params(self) -> list[str]:
         aliases = ["actor", "critic", "critic_target"]

@@ -12,6 +12,7 @@ from stable_baselines3.common.utils import FloatSchedule
 from torch import nn
 
 from sb3_ctco.common.soft_actor_critic import SoftOptionActorCritic, critic_loss, critic_target
+from sb3_ctco.ctco.gradients import HandGradients
 from sb3_ctco.ctco.policies import CnnPolicy, CTCOPolicy, MlpPolicy, MultiInputPolicy, OptionActor, OptionCritic
 
 __all__ = ["CTCO", "actor_loss", "critic_loss", "critic_target", "log_reference_density"]
@@ -194,6 +195,7 @@ class CTCO(SoftOptionActorCritic):
         self._duration_lr_schedule = (
             self.lr_schedule if self.duration_learning_rate is None else FloatSchedule(self.duration_learning_rate)
         )
+        self._hand_gradients: HandGradients | None = None
         assert self.d_min is not None
         self._log_reference = log_reference_density(self.actor.omega_dim, self.d_min, self.d_max, self.entropy_reference).to(
             self.device
@@ -225,14 +227,21 @@ class CTCO(SoftOptionActorCritic):
         return self.actor.option_log_prob(obs)
 
     def _critic_targets(self, data: ReplayBufferSamples) -> th.Tensor:
-        assert data.discounts is not None
         next_options, next_log_prob = self.actor_target.option_log_prob(data.next_observations)
-        next_q_values = self.critic_target(data.next_observations, next_options).amin(dim=0)
+        return self._targets(data, self.critic_target(data.next_observations, next_options), next_log_prob)
+
+    def _targets(self, data: ReplayBufferSamples, next_q_values: th.Tensor, next_log_prob: th.Tensor) -> th.Tensor:
+        """What the critics learn, ``[batch, 1]``.
+
+        :param next_q_values: of options that the target policy sampled, ``[n_critics, batch, 1]``
+        :param next_log_prob: log π of both parts of those, ``[batch, 2]``
+        """
+        assert data.discounts is not None
         return critic_target(
             data.rewards,
             data.dones,
             data.discounts,
-            next_q_values,
+            next_q_values.amin(dim=0),
             self.entropy_costs(next_log_prob),
             self._current_high_freq_penalty(),
         )
@@ -247,8 +256,21 @@ class CTCO(SoftOptionActorCritic):
         :param gradient_steps: number of updates
         :param batch_size: decisions in a minibatch
         """
+        self._prepare_hand_gradients()
         super().train(gradient_steps, batch_size)
         self.logger.record("option/high_freq_penalty", self._current_high_freq_penalty())
+
+    def _prepare_hand_gradients(self) -> None:
+        # Not possible before the first update, with which optimizers get their state.
+        if not HandGradients.possible_for(self):
+            self._hand_gradients = None
+        elif self._hand_gradients is None or not self._hand_gradients.is_valid():
+            self._hand_gradients = HandGradients(self)
+        else:
+            self._hand_gradients.refresh()
+
+    def _update(self, data: ReplayBufferSamples) -> th.Tensor:
+        return super()._update(data) if self._hand_gradients is None else self._hand_gradients.update(data)
 
     def _current_high_freq_penalty(self) -> float:
         # Read anew, so that it can be changed between trainings.
@@ -277,4 +299,4 @@ class CTCO(SoftOptionActorCritic):
         )
 
     def _excluded_save_params(self) -> list[str]:
-        return [*super()._excluded_save_params(), "actor_target", "_log_reference"]
+        return [*super()._excluded_save_params(), "actor_target", "_log_reference", "_hand_gradients"]
