@@ -62,6 +62,9 @@ def test_an_update_is_that_of_autograd(kwargs):
         expected = other.policy.state_dict()
         for name, value in model.policy.state_dict().items():
             th.testing.assert_close(value, expected[name], rtol=1e-5 * n_updates, atol=1e-6 * n_updates, msg=name)
+        for name in ("actor", "critic"):
+            states = [getattr(one, name).optimizer.state_dict()["state"] for one in (model, other)]
+            th.testing.assert_close(*states, rtol=1e-5 * n_updates, atol=1e-6 * n_updates)
         th.testing.assert_close(model.log_ent_coefs, other.log_ent_coefs, rtol=1e-6, atol=1e-6)
         for name in ("actor_loss", "critic_loss"):
             values = [one.logger.name_to_value[f"train/{name}"] for one in (model, other)]

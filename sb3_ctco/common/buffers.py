@@ -117,27 +117,28 @@ class _OptionStorage(ReplayBuffer):
         self.pos = (self.pos + count) % self.buffer_size
 
     def _sample_fields(self, batch_inds: np.ndarray, env: VecNormalize | None) -> dict[str, Any]:
-        # ReplayBuffer._get_samples of Stable-Baselines3 2.9 has no place for further fields, so it is written anew;
-        # indexing has made the copy that its to_torch would make again.
-        rows = (batch_inds, np.zeros_like(batch_inds))
-        dones = self.dones[rows] * (1.0 - self.timeouts[rows])
+        # ReplayBuffer._get_samples of Stable-Baselines3 2.9 has no place for further fields, so it is written anew.
+        def rows(stored: np.ndarray) -> np.ndarray:
+            return stored[:, 0].take(batch_inds, axis=0)  # makes the copy that to_torch would make again
+
+        def observations(stored: Any) -> Any:
+            if isinstance(stored, dict):
+                obs = self._normalize_obs({key: rows(values) for key, values in stored.items()}, env)
+                return {key: self._tensor(values) for key, values in obs.items()}  # type: ignore[union-attr]
+            return self._tensor(self._normalize_obs(rows(stored), env))  # type: ignore[arg-type]
+
+        dones = rows(self.dones) * (1.0 - rows(self.timeouts))
         return {
-            "observations": self._observations_at(self.observations, rows, env),
-            "actions": self._tensor(self.actions[rows]),
-            "next_observations": self._observations_at(self.next_observations, rows, env),
+            "observations": observations(self.observations),
+            "actions": self._tensor(rows(self.actions)),
+            "next_observations": observations(self.next_observations),
             "dones": self._tensor(dones[:, None]),
-            "rewards": self._tensor(self.integrated_rewards[rows][:, None]),
-            "discounts": self._tensor(discount(self.durations[rows], self.discount_rate)[:, None]),
+            "rewards": self._tensor(rows(self.integrated_rewards)[:, None]),
+            "discounts": self._tensor(discount(rows(self.durations), self.discount_rate)[:, None]),
         }
 
-    def _observations_at(self, stored: Any, rows: tuple[np.ndarray, np.ndarray], env: VecNormalize | None) -> Any:
-        if isinstance(stored, dict):
-            obs = self._normalize_obs({key: values[rows] for key, values in stored.items()}, env)
-            return {key: self._tensor(values) for key, values in obs.items()}  # type: ignore[union-attr]
-        return self._tensor(self._normalize_obs(stored[rows], env))  # type: ignore[arg-type]
-
     def _tensor(self, array: np.ndarray) -> th.Tensor:
-        return th.as_tensor(array, device=self.device)
+        return th.from_numpy(array).to(self.device)
 
 
 def _rows(obs: np.ndarray | dict[str, np.ndarray], row: slice) -> np.ndarray | dict[str, np.ndarray]:

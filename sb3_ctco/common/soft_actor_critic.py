@@ -5,7 +5,7 @@ from typing import Any
 
 import torch as th
 from stable_baselines3.common.type_aliases import GymEnv, PyTorchObs, ReplayBufferSamples, Schedule
-from stable_baselines3.common.utils import get_parameters_by_name, polyak_update
+from stable_baselines3.common.utils import FloatSchedule, get_parameters_by_name, polyak_update
 from torch import nn
 
 from sb3_ctco.common.option_algorithm import OptionOffPolicyAlgorithm
@@ -71,8 +71,8 @@ class SoftOptionActorCritic(OptionOffPolicyAlgorithm):
         *,
         ent_coef: str | float,
         duration_ent_coef: str | float,
-        target_entropy: str | float,
-        duration_target_entropy: str | float,
+        target_entropy: str | float | Schedule,
+        duration_target_entropy: str | float | Schedule,
         **kwargs: Any,
     ):
         super().__init__(policy, env, learning_rate, **kwargs)
@@ -123,7 +123,7 @@ class SoftOptionActorCritic(OptionOffPolicyAlgorithm):
             duration_coef, duration_learned = 0.0, False
         self._ent_coef_learned = th.tensor([learned, duration_learned], device=self.device)
         self._target_entropies = th.tensor(
-            [float(self.target_entropy), float(self.duration_target_entropy)], device=self.device
+            [FloatSchedule(self.target_entropy)(1.0), FloatSchedule(self.duration_target_entropy)(1.0)], device=self.device
         )
         self.log_ent_coefs = th.tensor([coef, duration_coef], device=self.device).log().requires_grad_(True)
         self.ent_coef_optimizer: th.optim.Adam | None = None
@@ -162,6 +162,9 @@ class SoftOptionActorCritic(OptionOffPolicyAlgorithm):
             optimizers.append(self.ent_coef_optimizer)
         self._update_learning_rate(optimizers)
 
+        for part, target in enumerate((self.target_entropy, self.duration_target_entropy)):
+            if callable(target):
+                self._target_entropies[part] = target(self._current_progress_remaining)
         losses = []
         for _ in range(gradient_steps):
             data = self.replay_buffer.sample(batch_size, env=self._vec_normalize_env)

@@ -258,6 +258,8 @@ class CTCO(SoftOptionActorCritic):
         """
         self._prepare_hand_gradients()
         super().train(gradient_steps, batch_size)
+        if self._hand_gradients is not None:
+            self._hand_gradients.write_back()
         self.logger.record("option/high_freq_penalty", self._current_high_freq_penalty())
 
     def _prepare_hand_gradients(self) -> None:

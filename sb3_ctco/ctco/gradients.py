@@ -7,15 +7,17 @@ losses are a few lines, and so are their gradients: :class:`HandGradients` does,
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import torch as th
 from stable_baselines3.common.torch_layers import FlattenExtractor
 from stable_baselines3.common.type_aliases import ReplayBufferSamples
 from torch import nn
+from torch.nn import functional as F
 
-from sb3_ctco.common.policies import LOG_STD_MAX, LOG_STD_MIN, EnsembleLinear, squashed_log_prob
+from sb3_ctco.common.policies import LOG_STD_MAX, LOG_STD_MIN, EnsembleLinear
 from sb3_ctco.common.soft_actor_critic import critic_loss, critic_target
 from sb3_ctco.ctco.policies import OptionActor, OptionCritic
 
@@ -101,6 +103,11 @@ class HandGradients:
         model._update_targets()
         return th.stack((pi_loss, q_loss, ent_coef_loss))
 
+    def write_back(self) -> None:
+        """Write to the optimizers how many steps they took."""
+        for adam in filter(None, (self._actor_adam, self._critic_adam, self._ent_coef_adam)):
+            adam.write_back()
+
     def _features(self, obs: th.Tensor) -> th.Tensor:
         return self._model.actor.extract_features(obs, self._model.actor.features_extractor)
 
@@ -171,11 +178,11 @@ class _PlainActor:
         self._heads = [PlainNetwork([actor.omega_head]), PlainNetwork([actor.duration_head])]
         self.gradients = {p: g for network in (self._body, *self._heads) for p, g in network.gradients.items()}
         self._scale = actor.squash_scale
-        self._log_scale = self._scale.log()
         self._omega_dim = actor.omega_dim
         # Sums the columns of ω in its first column, and has those of d in its second.
         self._parts = th.zeros(self._omega_dim + 1, 2, device=self._scale.device)
         self._parts[:-1, 0] = self._parts[-1, 1] = 1.0
+        self._constants = (-self._scale.log() - 0.5 * math.log(2 * math.pi) - 2.0 * math.log(2.0)) @ self._parts
 
     def sample(self, obs: th.Tensor) -> tuple[th.Tensor, th.Tensor]:
         """``OptionActor.option_log_prob``: options and log π of their parts."""
@@ -188,9 +195,10 @@ class _PlainActor:
         noise = th.randn_like(mean)
         self._deviation = noise * log_std.exp()
         y = (mean + self._deviation) * self._scale
-        log_prob = squashed_log_prob(noise, log_std, y) - self._log_scale
         self._options = y.tanh()
-        return self._options, log_prob @ self._parts
+        # squashed_log_prob in fewer operations: its constants are added in the end
+        log_prob = F.softplus(-2.0 * y).add_(y).mul_(2.0).sub_(th.addcmul(log_std, noise, noise, value=0.5))
+        return self._options, th.addmm(self._constants, log_prob, self._parts)
 
     def backward(self, option_gradient: th.Tensor, log_prob_gradient: th.Tensor) -> None:
         """Compute :attr:`gradients` from those of the last sample.
@@ -223,17 +231,20 @@ class _Adam:
     """
 
     def __init__(self, optimizer: th.optim.Optimizer, gradients: dict[nn.Parameter, th.Tensor]):
-        self._groups = []
+        self._groups: list[tuple[tuple[list[th.Tensor], ...], dict[str, Any]]] = []
+        self._counters: list[tuple[th.Tensor, list[th.Tensor]]] = []
         for group in optimizer.param_groups:
-            parameters = group["params"]
-            states = [optimizer.state[p] for p in parameters]
+            states = [optimizer.state[p] for p in group["params"]]
+            # Parameters of a group have taken the same number of steps. One counter serves all until the end.
+            count = states[0]["step"].clone()
+            self._counters.append((count, [state["step"] for state in states]))
             tensors = (
-                [p.detach() for p in parameters],
-                [gradients[p] for p in parameters],
+                [p.detach() for p in group["params"]],
+                [gradients[p] for p in group["params"]],
                 [state["exp_avg"] for state in states],
                 [state["exp_avg_sq"] for state in states],
                 [],
-                [state["step"] for state in states],
+                [count] * len(states),
             )
             options = {
                 "lr": group["lr"],
@@ -247,9 +258,14 @@ class _Adam:
             self._groups.append((tensors, options))
 
     def step(self) -> None:
-        for tensors, options in self._groups:
-            th._foreach_add_(tensors[-1], 1)
+        for (count, _), (tensors, options) in zip(self._counters, self._groups, strict=True):
+            count.add_(1.0)
             th._fused_adam_(*tensors, **options)
+
+    def write_back(self) -> None:
+        for count, steps in self._counters:
+            for step in steps:
+                step.copy_(count)
 
 
 def _has_own_losses(model: CTCO) -> bool:
