@@ -12,7 +12,7 @@ from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecNorm
 from torch.distributions import Normal
 
 from sb3_ctco import CTCO, DictOptionReplayBuffer, OptionExecutionWrapper, OptionReplayBuffer
-from sb3_ctco.ctco.ctco import actor_loss, critic_loss, critic_target, log_reference_density
+from sb3_ctco.ctco.ctco import actor_loss, critic_loss, critic_target, duration_weight, log_reference_density
 from sb3_ctco.ctco.policies import CTCOPolicy, EnsembleLinear, squashed_log_prob
 from sb3_ctco.options import DEFAULT_DISCOUNT_RATE, step_weight
 
@@ -104,11 +104,113 @@ def test_entropy_references():
 def test_a_decision_is_never_paid_for_its_entropy():
     """Relative to the uniform distribution the expected cost is a KL divergence, at least 0."""
     model = make(random_walk_like(), ent_coef=1.0, duration_ent_coef=1.0)
-    _, log_prob = model.actor.option_log_prob(th.zeros(4096, 2))
-    assert model.entropy_costs(log_prob).mean() > -0.05
+    options, log_prob = model.actor.option_log_prob(th.zeros(4096, 2))
+    assert model.entropy_costs(options, log_prob).mean() > -0.05
     # With the paper's density the same policy is paid at each decision.
     model = make(random_walk_like(), ent_coef=1.0, duration_ent_coef=1.0, entropy_reference="paper")
-    assert model.entropy_costs(log_prob).mean() < -0.5
+    assert model.entropy_costs(options, log_prob).mean() < -0.5
+
+
+def test_entropy_paid_as_a_rate():
+    """An entropy cost of 1/s for d seconds is worth (1 − e^(−τd))/τ, whatever the number of decisions it takes."""
+    # Options of 0.1, 0.55 and 1 s, without discounting and at 1 /s
+    durations = th.tensor([-1.0, 0.0, 1.0])
+    th.testing.assert_close(duration_weight(durations, 0.1, 1.0, 0.0), th.tensor([0.1, 0.55, 1.0]))
+    expected = th.tensor([1 - math.exp(-0.1), 1 - math.exp(-0.55), 1 - math.exp(-1.0)])
+    th.testing.assert_close(duration_weight(durations, 0.1, 1.0, 1.0), expected)
+    # Two options of 0.5 s cost what one of 1 s does.
+    half, whole = duration_weight(th.tensor([-0.5, 0.5]), 0.25, 1.25, 0.404)
+    assert half.item() + math.exp(-0.404 * 0.5) * half.item() == pytest.approx(whole.item(), rel=1e-6)
+
+    by_decision = make(random_walk_like(), ent_coef=1.0, duration_ent_coef=0.5)
+    by_time = make(random_walk_like(), ent_coef=1.0, duration_ent_coef=0.5, entropy_reference="duration")
+    options, log_prob = by_time.actor.option_log_prob(th.zeros(8, 2))
+    weights = duration_weight(options[:, -1:], 0.1, 1.0, by_time.discount_rate)
+    th.testing.assert_close(
+        by_time.entropy_costs(options, log_prob), weights * by_decision.entropy_costs(options, log_prob)
+    )
+
+
+class StaleOptionsEnv(gym.Env):
+    """What an option plays gets stale: it pays the rate 1 − (time since it began), whatever the action."""
+
+    dt = 0.02
+    observation_space = spaces.Box(-1.0, 1.0, (1,), np.float32)
+    action_space = spaces.Box(-1.0, 1.0, (1,), np.float32)
+    _obs = np.zeros(1, dtype=np.float32)
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        self._time = 0.0
+        return self._obs, {}
+
+    def step_sequence(self, actions):
+        ages = self.dt * np.arange(len(actions))
+        self._time += self.dt * len(actions)
+        return self._obs, 1.0 - ages, False, self._time >= 20.0, {}
+
+
+def penalty_of(decision_rate, discount_rate=DEFAULT_DISCOUNT_RATE):
+    """β_h with which StaleOptionsEnv's best options are ``1/decision_rate`` long.
+
+    V(d) = (R(d) − β)/(1 − e^(−τd)) is largest where β = R − R'(1 − e^(−τd))/(τe^(−τd)); with R = w − K,
+    w = (1 − e^(−τd))/τ, K = ∫κe^(−τκ) dκ = (1 − e^(−τd)(1 + τd))/τ² and R' = e^(−τd)(1 − d), that is d·w − K.
+    """
+    d, rate = 1.0 / decision_rate, discount_rate
+    w = (1 - math.exp(-rate * d)) / rate
+    return d * w - (1 - math.exp(-rate * d) * (1 + rate * d)) / rate**2
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("decision_rate", [2.0, 5.0])
+def test_the_penalty_is_found_that_keeps_a_decision_rate(decision_rate):
+    assert penalty_of(2.0) == pytest.approx(0.5 * 0.5**2, rel=0.1)  # ½d² without discounting
+    model = make(
+        StaleOptionsEnv(),
+        target_decision_rate=decision_rate,
+        high_freq_penalty=0.05,
+        d_max=1.0,
+        n_rbf=1,
+        learning_rate=3e-3,
+        tau=0.02,
+        batch_size=64,
+        ent_coef=0.0,
+        duration_ent_coef=0.001,
+        updates_per_second=10,
+        policy_kwargs={"net_arch": [32]},
+    )
+    penalties, rates = [], []
+
+    def record(local_variables, global_variables):
+        penalties.append(model._current_high_freq_penalty())
+        rates.append((model.replay_buffer.n_decisions, model.replay_buffer.decision_seconds))
+        return True
+
+    model.learn(round(600 / model.get_env().envs[0].unwrapped.dt), callback=record)
+    half = len(rates) // 2
+    decisions, seconds = np.subtract(rates[-1], rates[half])
+    assert decisions / seconds == pytest.approx(decision_rate, rel=0.1)
+    assert np.mean(penalties[half:]) == pytest.approx(penalty_of(decision_rate), rel=0.2)
+
+
+def test_a_decision_rate_is_kept_from_above_only():
+    """While options are longer than they need be, the penalty falls, and it never pays to be slower still."""
+    model = make(StaleOptionsEnv(), target_decision_rate=1000.0, learning_rate=0.01).learn(200)
+    falling = model._current_high_freq_penalty()
+    assert 0.0 < falling < 0.05
+    model.target_decision_rate = 0.1
+    model.learn(2000, reset_num_timesteps=False)
+    assert model._current_high_freq_penalty() > falling
+
+
+def test_the_found_penalty_is_logged_saved_and_loaded(tmp_path):
+    model = make(StaleOptionsEnv(), target_decision_rate=3.0, learning_rate=0.01).learn(200)
+    assert model.logger.name_to_value["option/high_freq_penalty"] == pytest.approx(model._current_high_freq_penalty(), rel=0.05)
+    model.save(tmp_path / "model")
+    loaded = CTCO.load(tmp_path / "model", env=StaleOptionsEnv(), device="cpu")
+    assert loaded._current_high_freq_penalty() == model._current_high_freq_penalty() != 0.05
+    loaded.learn(100, reset_num_timesteps=False)
+    assert loaded._current_high_freq_penalty() != model._current_high_freq_penalty()
 
 
 def random_walk_like():
@@ -271,7 +373,7 @@ def test_options_of_one_step_are_sac(scripted_env):
     with th.no_grad():
         options, log_prob = model.actor_target.option_log_prob(ours.next_observations)
         next_q = model.critic_target(ours.next_observations, options).amin(dim=0)
-        target = critic_target(ours.rewards, ours.dones, ours.discounts, next_q, model.entropy_costs(log_prob), 0.0)
+        target = critic_target(ours.rewards, ours.dones, ours.discounts, next_q, model.entropy_costs(options, log_prob), 0.0)
         # SAC's target, with the tanh Gaussian of the action alone
         mean, log_std = model.actor_target.distribution_parameters(theirs.next_observations)
         action = options[:, :1].double()
@@ -386,6 +488,8 @@ def test_action_noise(random_walk_env):
         ({"gamma": 1.5}, "gamma"),
         ({"gamma_dt": 0.0}, "gamma_dt"),
         ({"entropy_reference": "gaussian"}, "entropy_reference"),
+        ({"target_decision_rate": 0.0}, "target_decision_rate must be a positive number of Hz"),
+        ({"target_decision_rate": 5.0, "high_freq_penalty": 0.0}, "high_freq_penalty=0.0 must be a positive number"),
         ({"replay_buffer_class": ReplayBuffer}, "OptionReplayBuffer"),
         ({"replay_buffer_kwargs": {"optimize_memory_usage": True}}, "optimize_memory_usage"),
         ({"policy_kwargs": {"n_critics": 0}}, "n_critics"),

@@ -45,6 +45,9 @@ class _OptionStorage(ReplayBuffer):
         self.discount_rate = float(discount_rate)
         self.durations = np.zeros((self.buffer_size, self.n_envs), dtype=np.float32)
         self.integrated_rewards = np.zeros((self.buffer_size, self.n_envs), dtype=np.float32)
+        #: How many decisions were ever added (without sub-options), and how long their options took, in s.
+        self.n_decisions = 0
+        self.decision_seconds = 0.0
 
     def add(  # type: ignore[override]
         self,
@@ -90,6 +93,8 @@ class _OptionStorage(ReplayBuffer):
             )
             self.durations[position] = durations[i]
             self.integrated_rewards[position] = integrated_rewards[i]
+            self.n_decisions += 1
+            self.decision_seconds += float(durations[i])
             if "sub_options" in info:
                 self._add_sub_options(info["sub_options"])
 

@@ -8,9 +8,10 @@ from stable_baselines3.common.buffers import ReplayBuffer
 from stable_baselines3.common.noise import ActionNoise
 from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, PyTorchObs, ReplayBufferSamples, Schedule
-from stable_baselines3.common.utils import FloatSchedule
+from stable_baselines3.common.utils import FloatSchedule, update_learning_rate
 from torch import nn
 
+from sb3_ctco.common.buffers import DictOptionReplayBuffer, OptionReplayBuffer
 from sb3_ctco.common.soft_actor_critic import SoftOptionActorCritic, critic_loss, critic_target
 from sb3_ctco.ctco.gradients import HandGradients
 from sb3_ctco.ctco.policies import CnnPolicy, CTCOPolicy, MlpPolicy, MultiInputPolicy, OptionActor, OptionCritic
@@ -19,7 +20,8 @@ __all__ = ["CTCO", "actor_loss", "critic_loss", "critic_target", "log_reference_
 
 SelfCTCO = TypeVar("SelfCTCO", bound="CTCO")
 
-EntropyReference = Literal["uniform", "paper"]
+EntropyReference = Literal["uniform", "paper", "duration"]
+ENTROPY_REFERENCES: tuple[EntropyReference, ...] = ("uniform", "paper", "duration")
 
 
 def actor_loss(q_values: th.Tensor, entropy_costs: th.Tensor) -> th.Tensor:
@@ -36,13 +38,28 @@ def log_reference_density(omega_dim: int, d_min: float, d_max: float, reference:
 
     ``"uniform"`` is the uniform distribution over all options: log π − log u is never negative on average, so
     a decision is never paid for its entropy. ``"paper"`` is the unit density over (ω, d in s): log π as it stands.
+    ``"duration"`` counts relative to the uniform distribution, too, and weights a decision's entropy by its option's
+    duration, see :func:`duration_weight`.
 
     :return: for ω and d, shape ``[2]``
     """
-    if reference == "uniform":
+    if reference != "paper":
         return th.tensor([-omega_dim * math.log(2.0), -math.log(2.0)])
     # A duration in s has (d_max − d_min)/2 of the length of the box [−1, 1].
     return th.tensor([0.0, math.log((d_max - d_min) / 2.0) if d_max > d_min else 0.0])
+
+
+def duration_weight(durations: th.Tensor, d_min: float, d_max: float, discount_rate: float) -> th.Tensor:
+    """(1 − e^(−τd))/τ: what an entropy that is paid as a rate, for as long as an option runs, is worth at its start.
+
+    :param durations: normalised to [−1, 1], any shape
+    :param d_min: in s
+    :param d_max: in s
+    :param discount_rate: τ, in 1/s
+    :return: in s, the shape of ``durations``; the limit d for τ → 0
+    """
+    seconds = d_min + 0.5 * (durations + 1.0) * (d_max - d_min)
+    return -th.expm1(-discount_rate * seconds) / discount_rate if discount_rate > 0 else seconds
 
 
 class CTCO(SoftOptionActorCritic):
@@ -82,12 +99,15 @@ class CTCO(SoftOptionActorCritic):
     :param dt: interaction period of the environment, in s; by default found in the environment
     :param high_freq_penalty: β_h, subtracted once a decision in the critic's target, or a function of the remaining
         progress
+    :param target_decision_rate: in Hz, in place of a fixed β_h: ``high_freq_penalty`` is where β_h starts, and it rises
+        while the policy decides more often than this, and falls while it decides less often
     :param ent_coef: temperature of ω: a number, ``"auto"`` to learn it, or ``"auto_0.1"`` to start at 0.1
     :param duration_ent_coef: temperature of d, likewise
-    :param target_entropy: entropy of ω over the box [−1, 1] that a learned temperature keeps; ``"auto"`` is −dim(ω)
+    :param target_entropy: entropy of ω over the box [−1, 1] that a learned temperature keeps, or a function of the
+        remaining progress; ``"auto"`` is −dim(ω)
     :param duration_target_entropy: likewise for d; ``"auto"`` is −1
     :param duration_learning_rate: step size of d's head; ``learning_rate`` by default
-    :param entropy_reference: ``"uniform"`` or ``"paper"``, see :func:`log_reference_density`
+    :param entropy_reference: ``"uniform"``, ``"paper"`` or ``"duration"``, see :func:`log_reference_density`
     :param action_noise: noise added to normalised options while exploring
     :param replay_buffer_class: ``OptionReplayBuffer`` or ``DictOptionReplayBuffer``, or a subclass
     :param replay_buffer_kwargs: keyword arguments for the replay buffer
@@ -132,10 +152,11 @@ class CTCO(SoftOptionActorCritic):
         d_min: float | None = None,
         dt: float | None = None,
         high_freq_penalty: float | Schedule = 0.05,
+        target_decision_rate: float | None = None,
         ent_coef: str | float = "auto",
         duration_ent_coef: str | float = "auto",
-        target_entropy: str | float = "auto",
-        duration_target_entropy: str | float = "auto",
+        target_entropy: str | float | Schedule = "auto",
+        duration_target_entropy: str | float | Schedule = "auto",
         duration_learning_rate: float | Schedule | None = None,
         entropy_reference: EntropyReference = "uniform",
         action_noise: ActionNoise | None = None,
@@ -149,8 +170,15 @@ class CTCO(SoftOptionActorCritic):
         device: th.device | str = "auto",
         _init_setup_model: bool = True,
     ):
-        if entropy_reference not in ("uniform", "paper"):
-            raise ValueError(f"entropy_reference must be 'uniform' or 'paper', not {entropy_reference!r}")
+        if entropy_reference not in ENTROPY_REFERENCES:
+            raise ValueError(f"entropy_reference must be one of {ENTROPY_REFERENCES}, not {entropy_reference!r}")
+        if target_decision_rate is not None and not target_decision_rate > 0:
+            raise ValueError(f"target_decision_rate must be a positive number of Hz or None, not {target_decision_rate}")
+        if target_decision_rate is not None and not (isinstance(high_freq_penalty, int | float) and high_freq_penalty > 0):
+            raise ValueError(
+                f"with a target_decision_rate, high_freq_penalty={high_freq_penalty} must be a positive number: "
+                "β_h starts there, and its logarithm is learned"
+            )
         super().__init__(
             policy,
             env,
@@ -184,6 +212,7 @@ class CTCO(SoftOptionActorCritic):
             device=device,
         )
         self.high_freq_penalty = high_freq_penalty
+        self.target_decision_rate = target_decision_rate
         self.duration_learning_rate = duration_learning_rate
         self.entropy_reference: EntropyReference = entropy_reference
 
@@ -196,6 +225,12 @@ class CTCO(SoftOptionActorCritic):
             self.lr_schedule if self.duration_learning_rate is None else FloatSchedule(self.duration_learning_rate)
         )
         self._hand_gradients: HandGradients | None = None
+        if self.target_decision_rate is not None:
+            assert isinstance(self.high_freq_penalty, int | float)
+            self.log_high_freq_penalty = th.tensor(math.log(self.high_freq_penalty), requires_grad=True)
+            self.high_freq_penalty_optimizer = th.optim.Adam([self.log_high_freq_penalty], lr=self.lr_schedule(1))
+            #: What the replay buffer had counted at the last training: decisions, and their time in s.
+            self._counted_decisions = (0, 0.0)
         assert self.d_min is not None
         self._log_reference = log_reference_density(self.actor.omega_dim, self.d_min, self.d_max, self.entropy_reference).to(
             self.device
@@ -215,26 +250,32 @@ class CTCO(SoftOptionActorCritic):
         super()._update_learning_rate(optimizers)
         self.actor.optimizer.param_groups[1]["lr"] = self._duration_lr_schedule(self._current_progress_remaining)
 
-    def entropy_costs(self, log_prob: th.Tensor) -> th.Tensor:
+    def entropy_costs(self, options: th.Tensor, log_prob: th.Tensor) -> th.Tensor:
         """β_E log π relative to the reference, ω's and d's with their own temperature.
 
-        :param log_prob: log π(ω|s) and log π(d|s), ``[batch, 2]``
+        :param options: ``[batch, omega_dim + 1]``, normalised
+        :param log_prob: log π(ω|s) and log π(d|s) of those, ``[batch, 2]``
         :return: ``[batch, 1]``
         """
-        return ((log_prob - self._log_reference) @ self.ent_coefs)[:, None]
+        costs = ((log_prob - self._log_reference) @ self.ent_coefs)[:, None]
+        if self.entropy_reference != "duration":
+            return costs
+        assert self.d_min is not None
+        return costs * duration_weight(options[:, -1:], self.d_min, self.d_max, self.discount_rate)
 
     def _sample_policy(self, obs: PyTorchObs) -> tuple[th.Tensor, ...]:
         return self.actor.option_log_prob(obs)
 
     def _critic_targets(self, data: ReplayBufferSamples) -> th.Tensor:
         next_options, next_log_prob = self.actor_target.option_log_prob(data.next_observations)
-        return self._targets(data, self.critic_target(data.next_observations, next_options), next_log_prob)
+        next_q_values = self.critic_target(data.next_observations, next_options)
+        return self._targets(data, next_q_values, self.entropy_costs(next_options, next_log_prob))
 
-    def _targets(self, data: ReplayBufferSamples, next_q_values: th.Tensor, next_log_prob: th.Tensor) -> th.Tensor:
+    def _targets(self, data: ReplayBufferSamples, next_q_values: th.Tensor, next_entropy_costs: th.Tensor) -> th.Tensor:
         """What the critics learn, ``[batch, 1]``.
 
         :param next_q_values: of options that the target policy sampled, ``[n_critics, batch, 1]``
-        :param next_log_prob: log π of both parts of those, ``[batch, 2]``
+        :param next_entropy_costs: of those, ``[batch, 1]``
         """
         assert data.discounts is not None
         return critic_target(
@@ -242,13 +283,13 @@ class CTCO(SoftOptionActorCritic):
             data.dones,
             data.discounts,
             next_q_values.amin(dim=0),
-            self.entropy_costs(next_log_prob),
+            next_entropy_costs,
             self._current_high_freq_penalty(),
         )
 
     def _actor_loss(self, obs: PyTorchObs, sample: tuple[th.Tensor, ...]) -> th.Tensor:
         options, log_prob = sample
-        return actor_loss(self.critic(obs, options), self.entropy_costs(log_prob))
+        return actor_loss(self.critic(obs, options), self.entropy_costs(options, log_prob))
 
     def train(self, gradient_steps: int, batch_size: int = 64) -> None:
         """Sample the replay buffer and update temperatures, critics, actor and targets.
@@ -256,6 +297,8 @@ class CTCO(SoftOptionActorCritic):
         :param gradient_steps: number of updates
         :param batch_size: decisions in a minibatch
         """
+        if self.target_decision_rate is not None:
+            self._update_high_freq_penalty()
         self._prepare_hand_gradients()
         super().train(gradient_steps, batch_size)
         if self._hand_gradients is not None:
@@ -275,8 +318,28 @@ class CTCO(SoftOptionActorCritic):
         return super()._update(data) if self._hand_gradients is None else self._hand_gradients.update(data)
 
     def _current_high_freq_penalty(self) -> float:
+        if self.target_decision_rate is not None:
+            return math.exp(self.log_high_freq_penalty.item())
         # Read anew, so that it can be changed between trainings.
         return FloatSchedule(self.high_freq_penalty)(self._current_progress_remaining)
+
+    def _update_high_freq_penalty(self) -> None:
+        """Dual ascent on log β_h, as SAC's on its temperature, with the decisions since the last training.
+
+        The constraint is that their mean duration be at least ``1/target_decision_rate``.
+        """
+        assert isinstance(self.replay_buffer, OptionReplayBuffer | DictOptionReplayBuffer)
+        assert self.target_decision_rate is not None
+        count, seconds = self.replay_buffer.n_decisions, self.replay_buffer.decision_seconds
+        decisions, time_played = count - self._counted_decisions[0], seconds - self._counted_decisions[1]
+        self._counted_decisions = (count, seconds)
+        if decisions <= 0:
+            return  # none, or another buffer was loaded
+        update_learning_rate(self.high_freq_penalty_optimizer, self.lr_schedule(self._current_progress_remaining))
+        # Bounded, so that rare long options do not make Adam's steps small for long.
+        shortfall = max(-1.0, 1.0 - self.target_decision_rate * time_played / decisions)
+        self.log_high_freq_penalty.grad = th.tensor(-shortfall)
+        self.high_freq_penalty_optimizer.step()
 
     def learn(
         self: SelfCTCO,
@@ -302,3 +365,9 @@ class CTCO(SoftOptionActorCritic):
 
     def _excluded_save_params(self) -> list[str]:
         return [*super()._excluded_save_params(), "actor_target", "_log_reference", "_hand_gradients"]
+
+    def _get_torch_save_params(self) -> tuple[list[str], list[str]]:
+        state_dicts, tensors = super()._get_torch_save_params()
+        if self.target_decision_rate is not None:
+            state_dicts, tensors = [*state_dicts, "high_freq_penalty_optimizer"], [*tensors, "log_high_freq_penalty"]
+        return state_dicts, tensors

@@ -49,6 +49,7 @@ class HandGradients:
         optimizers = [model.actor.optimizer, model.critic.optimizer, *filter(None, [model.ent_coef_optimizer])]
         return (
             _has_own_losses(model)
+            and model.entropy_reference != "duration"  # whose weight is another way to the gradient of d
             and all(type(actor) is OptionActor and _is_plain(actor.latent_pi, nn.Linear) for actor in actors)
             and all(type(critic) is OptionCritic and _is_plain(critic.q_networks, EnsembleLinear) for critic in critics)
             and all(type(network.features_extractor) is FlattenExtractor for network in actors + critics)
@@ -87,7 +88,7 @@ class HandGradients:
 
         next_options, next_log_prob = self._actor_target.sample(next_obs)
         next_q_values = self._critic_target.forward(th.cat((next_obs, next_options), dim=1))
-        targets = model._targets(data, next_q_values, next_log_prob)
+        targets = model._targets(data, next_q_values, model.entropy_costs(next_options, next_log_prob))
         q_values = self._critic.forward(th.cat((obs, data.actions), dim=1))
         self._critic.backward((q_values - targets) / len(obs))
         self._critic_adam.step()
@@ -95,7 +96,7 @@ class HandGradients:
 
         q_values = self._critic.forward(th.cat((obs, options), dim=1))
         q_min = q_values.amin(dim=0)
-        pi_loss = (model.entropy_costs(log_prob) - q_min).mean()
+        pi_loss = (model.entropy_costs(options, log_prob) - q_min).mean()
         option_gradient = self._critic.input_gradient((q_values == q_min) / -len(obs), first=obs.shape[1])
         self._actor.backward(option_gradient, model.ent_coefs / len(obs))
         self._actor_adam.step()
