@@ -11,7 +11,7 @@ import numpy as np
 import numpy.typing as npt
 from gymnasium import spaces
 
-from sb3_ctco.options import OptionSettings, action_plan, basis, primitive_actions
+from sb3_ctco.options import ActionBox, OptionSettings, action_plan, basis
 
 if TYPE_CHECKING:
     from stable_baselines3.common.vec_env import VecNormalize
@@ -204,8 +204,7 @@ class OptionController:
         trained = self.policy.option_settings
         #: What options mean here: training's settings, at this controller's ``dt``.
         self.settings = trained if dt is None else replace(trained, dt=dt)
-        self._low = self.policy.primitive_action_space.low
-        self._high = self.policy.primitive_action_space.high
+        self._box = ActionBox(self.policy.primitive_action_space.low, self.policy.primitive_action_space.high)
         self._executions: list[_Execution] = []
         self._several = False
         self._now: float | None = None
@@ -273,7 +272,7 @@ class OptionController:
             # A late tick may find the phase past its end, where the option holds its last action.
             phase = min((now - e.start) / (e.n_steps * dt), 1.0)
             trajectory = basis(np.array([phase]), self.settings.n_rbf) @ e.omega.T
-            actions.append(primitive_actions(trajectory, self._low, self._high)[0])
+            actions.append(self._box.actions(trajectory)[0])
         return np.stack(actions) if self._several else actions[0]
 
     def _decide(self, observation: Observation, due: list[int], now: float) -> None:
@@ -294,7 +293,7 @@ class OptionController:
         # As OptionExecutionWrapper does, in the same precision.
         option = np.clip(option.astype(np.float64), -1.0, 1.0)
         omega, n_steps = self.settings.decode(option)
-        plan = primitive_actions(action_plan(omega, n_steps), self._low, self._high)
+        plan = self._box.actions(action_plan(omega, n_steps))
         return _Execution(option, omega, n_steps, plan, start=now)
 
     @property

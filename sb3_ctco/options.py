@@ -16,7 +16,9 @@ R              ``integrated_reward``                        reward rate × s
 ============== ============================================ ====================
 """
 
+import itertools
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 from typing import Any, Literal
@@ -55,6 +57,17 @@ def discount(duration: FloatArray | float, discount_rate: float) -> FloatArray:
     :return: discount, the shape of ``duration``
     """
     return np.exp(-discount_rate * np.asarray(duration))
+
+
+@lru_cache(maxsize=4096)
+def discounts_of_steps(n_steps: int, dt: float, discount_rate: float) -> FloatArray:
+    """e^(−τk·dt) at the beginning of the steps k = 0, …, n − 1. Cached and read-only.
+
+    :return: shape ``[n_steps]``
+    """
+    discounts = discount(np.arange(n_steps) * dt, discount_rate)
+    discounts.setflags(write=False)
+    return discounts
 
 
 def steps_in(duration: float, dt: float) -> int:
@@ -110,40 +123,57 @@ def action_plan(omega: FloatArray, n_steps: int) -> FloatArray:
 
 
 @lru_cache(maxsize=4096)
-def _pseudo_inverse(n_steps: int, n_rbf: int) -> FloatArray:
+def _fit(n_steps: int, n_rbf: int) -> FloatArray:
     """What turns an action plan of n steps into the weights that fit it best, ``[n_rbf, n_steps]``."""
-    return np.linalg.pinv(basis_of_steps(n_steps, n_rbf))
+    # About the plan's mean, which equal weights give exactly: where few steps leave weights open, they stay near it.
+    mean = np.full((1, n_steps), 1.0 / n_steps)
+    inverse = np.linalg.pinv(basis_of_steps(n_steps, n_rbf))
+    return mean + inverse - inverse.sum(axis=1, keepdims=True) * mean
 
 
-def fit_weights(plan: FloatArray, n_rbf: int) -> tuple[FloatArray, float]:
-    """The option of as many steps whose actions come closest to a plan: least squares, clipped to [−1, 1].
+def fit_slices(plan: FloatArray, slices: Sequence[tuple[int, int]], n_rbf: int) -> tuple[FloatArray, FloatArray]:
+    """The options whose actions come closest to stretches of a plan: least squares, clipped to [−1, 1].
 
-    Exact for ``n_rbf=1`` and a constant plan, and for the plan of an option of the same length.
+    Exact for ``n_rbf=1`` and a constant plan, and for the whole plan of an option of at least n_rbf steps.
 
     :param plan: normalised actions, shape ``[n_steps, action_dim]``
+    :param slices: ``(first step, step after the last)`` of each stretch, of at least one step
     :param n_rbf: number of basis functions
-    :return: ω, shape ``[action_dim, n_rbf]``, and the residual, the largest deviation of an action from the plan
+    :return: ω, shape ``[n, action_dim, n_rbf]``, and the residuals, the largest deviation of an action from the plan,
+        shape ``[n]``
     """
-    n_steps = len(plan)
-    # About the plan's mean, which equal weights give exactly: where few steps leave weights open, they stay near it.
-    mean = plan.mean(axis=0)
-    omega = (mean + _pseudo_inverse(n_steps, n_rbf) @ (plan - mean)).clip(-1.0, 1.0)
-    deviation = basis_of_steps(n_steps, n_rbf) @ omega - plan
-    return omega.T, max(float(deviation.max()), -float(deviation.min()))
+    if not slices:
+        return np.empty((0, plan.shape[1], n_rbf)), np.empty(0)
+    plans = [plan[first:end] for first, end in slices]
+    omega = np.array([_fit(len(actions), n_rbf) @ actions for actions in plans]).clip(-1.0, 1.0)
+    # One row a step, the stretches one after the other
+    fitted = [basis_of_steps(len(actions), n_rbf) @ weights for actions, weights in zip(plans, omega, strict=True)]
+    deviations = np.abs(np.concatenate(fitted) - np.concatenate(plans))
+    starts = list(itertools.accumulate(map(len, plans[:-1]), initial=0))
+    return omega.swapaxes(1, 2), np.maximum.reduceat(deviations, starts, axis=0).max(axis=1)
 
 
-def primitive_actions(trajectory: FloatArray, low: npt.NDArray[Any], high: npt.NDArray[Any]) -> npt.NDArray[Any]:
-    """Normalised actions in the units of an action box.
+class ActionBox:
+    """The bounds of primitive actions, to which normalised ones are scaled.
 
-    :param trajectory: actions in [−1, 1], shape ``[n_steps, action_dim]``
-    :param low: lower bounds of the box, shape ``action_shape``, of which action_dim is the product
+    :param low: lower bounds, shape ``action_shape``, of which action_dim is the product
     :param high: upper bounds, likewise
-    :return: shape ``[n_steps, *action_shape]``, in the precision of ``low``
     """
-    bottom = low.astype(np.float64).ravel()
-    actions = bottom + (0.5 * (trajectory + 1.0)) * (high.astype(np.float64).ravel() - bottom)
-    # The cast to the box's precision may round past a bound.
-    return actions.astype(low.dtype).reshape(-1, *low.shape).clip(low, high)
+
+    def __init__(self, low: npt.NDArray[Any], high: npt.NDArray[Any]):
+        self.low, self.high = low, high
+        self._bottom = low.astype(np.float64).ravel()
+        self._width = high.astype(np.float64).ravel() - self._bottom
+
+    def actions(self, trajectory: FloatArray) -> npt.NDArray[Any]:
+        """Normalised actions in the units of the box.
+
+        :param trajectory: actions in [−1, 1], shape ``[n_steps, action_dim]``
+        :return: shape ``[n_steps, *action_shape]``, in the precision of ``low``
+        """
+        actions = self._bottom + (0.5 * (trajectory + 1.0)) * self._width
+        # The cast to the box's precision may round past a bound.
+        return actions.astype(self.low.dtype).reshape(-1, *self.low.shape).clip(self.low, self.high)
 
 
 def step_weight(dt: float, discount_rate: float) -> float:
@@ -168,7 +198,7 @@ def integrated_reward(rewards: FloatArray, dt: float, discount_rate: float, unit
     :return: R, in reward rate × s, or in reward for impulses
     """
     rewards = np.asarray(rewards, dtype=np.float64)
-    total = float(rewards @ discount(np.arange(len(rewards)) * dt, discount_rate))
+    total = float(rewards @ discounts_of_steps(len(rewards), dt, discount_rate))
     return total * step_weight(dt, discount_rate) if unit == "rate" else total
 
 

@@ -21,18 +21,19 @@ from stable_baselines3.common.monitor import Monitor
 from sb3_ctco.options import (
     DEFAULT_DISCOUNT_RATE,
     REWARD_UNITS,
+    ActionBox,
     OptionSettings,
     RewardUnit,
     action_plan,
-    discount,
-    fit_weights,
+    discounts_of_steps,
+    fit_slices,
     integrated_reward,
-    primitive_actions,
     step_weight,
 )
 
 SequenceResult = tuple[Any, npt.ArrayLike, bool, bool, dict[str, Any]]
 StepSequence = Callable[..., SequenceResult]
+Stacked = np.ndarray | dict[str, np.ndarray]
 
 
 @runtime_checkable
@@ -74,10 +75,11 @@ def find_dt(env: gym.Env) -> float | None:
 class SubOptions:
     """Shorter options that an option contained, as transitions: ``info["sub_options"]``.
 
-    Every field has one entry a sub-option.
+    Every field but ``seen`` has one entry a sub-option.
 
-    :param observations: where they began
-    :param next_observations: where they ended
+    :param seen: the observations at their ends, stacked: ``[n_seen, *observation_shape]``, or a dictionary of such
+    :param begins: rows of ``seen`` where they began, ``[n]``
+    :param ends: rows of ``seen`` where they ended, ``[n]``
     :param options: option vectors, float32 ``[n, option_dim]``
     :param durations: in s, ``[n]``
     :param integrated_rewards: R of each, ``[n]``
@@ -86,8 +88,9 @@ class SubOptions:
     :param residuals: largest deviation of its actions from those that were played, normalised, ``[n]``
     """
 
-    observations: list[Any]
-    next_observations: list[Any]
+    seen: Stacked
+    begins: np.ndarray
+    ends: np.ndarray
     options: np.ndarray
     durations: np.ndarray
     integrated_rewards: np.ndarray
@@ -95,12 +98,32 @@ class SubOptions:
     truncated: np.ndarray
     residuals: np.ndarray
 
+    @property
+    def observations(self) -> Stacked:
+        """Where they began, ``[n, *observation_shape]``, or a dictionary of such."""
+        return _at(self.seen, self.begins)
+
+    @property
+    def next_observations(self) -> Stacked:
+        """Where they ended, likewise."""
+        return _at(self.seen, self.ends)
+
     def __len__(self) -> int:
         return len(self.options)
 
     def __deepcopy__(self, memo: dict[int, Any]) -> "SubOptions":
         # Stable-Baselines3 copies infos deeply; what nobody writes to need not be copied.
         return self
+
+
+def _stack(observations: list[Any]) -> Stacked:
+    if isinstance(observations[0], dict):
+        return {key: np.array([obs[key] for obs in observations]) for key in observations[0]}
+    return np.array(observations)
+
+
+def _at(stacked: Stacked, rows: Any) -> Any:
+    return {key: value[rows] for key, value in stacked.items()} if isinstance(stacked, dict) else stacked[rows]
 
 
 class OptionExecutionWrapper(gym.Wrapper, RecordConstructorArgs):
@@ -209,6 +232,7 @@ class OptionExecutionWrapper(gym.Wrapper, RecordConstructorArgs):
 
         #: The action space of the environment inside.
         self.primitive_action_space = space
+        self._box = ActionBox(space.low, space.high)
         option_dim = space.low.size * n_rbf + 1
         self.action_space = spaces.Box(-1.0, 1.0, (option_dim,), np.float32)
         self._checks_observation = isinstance(env.observation_space, spaces.Box) and np.issubdtype(
@@ -218,6 +242,7 @@ class OptionExecutionWrapper(gym.Wrapper, RecordConstructorArgs):
 
         self.n_sub_options = n_sub_options
         self.sub_option_tolerance = sub_option_tolerance
+        self._shortest = math.ceil(self.option_settings.d_min / dt - 1e-6)
         # A generator of its own, so that sub-options change nothing in what the environment does.
         self._slice_rng = np.random.default_rng()
         self._last_obs: Any = None
@@ -249,39 +274,42 @@ class OptionExecutionWrapper(gym.Wrapper, RecordConstructorArgs):
             raise ResetNeeded("call reset() first: the environment was not reset, its episode ended, or it raised an error")
         play, self._play = self._play, None
 
-        omega, n_steps = self.option_settings.decode(np.clip(option, -1.0, 1.0))
+        settings = self.option_settings
+        omega, n_steps = settings.decode(option.clip(-1.0, 1.0))
         trajectory = action_plan(omega, n_steps)
         slices = self._draw_slices(n_steps)
         observe = sorted({k for ends in slices for k in ends} - {0, n_steps})
-        actions = self._primitive(trajectory)
+        actions = self._box.actions(trajectory)
         obs, rewards, terminated, truncated, info = play(actions, observe) if observe else play(actions)
         observations = info.pop("observations", []) if observe else []
 
         rewards = np.asarray(rewards, dtype=np.float64)
-        if not np.isfinite(rewards).all():
+        total = float(rewards.sum())
+        if not math.isfinite(total):
             raise ValueError(f"the environment {self.env} returned a reward that is not finite: {rewards}")
-        if self._checks_observation:
-            for seen_obs in (*observations, obs):
-                if not np.isfinite(seen_obs).all():
-                    raise ValueError(f"the environment {self.env} returned an observation that is not finite: {seen_obs}")
+        # Stacked, they are copies, too: the environment may overwrite its own.
+        seen = _stack([self._last_obs, *observations, obs]) if self.n_sub_options else None
+        if self._checks_observation and not np.isfinite(obs if seen is None else seen).all():  # type: ignore[arg-type]
+            raise ValueError(
+                f"the environment {self.env} returned an observation that is not finite: {obs if seen is None else seen}"
+            )
         if not (terminated or truncated):
             self._play = play
 
-        settings = self.option_settings
-        duration = len(rewards) * settings.dt
+        n_ran = len(rewards)
+        duration = n_ran * settings.dt
         integral = integrated_reward(rewards, settings.dt, settings.discount_rate, self.reward_unit)
         info["option"] = {
             "duration": duration,
-            "n_steps": len(rewards),
+            "n_steps": n_ran,
             "integrated_reward": integral,
-            "discount": float(discount(duration, settings.discount_rate)),
+            "discount": math.exp(-settings.discount_rate * duration),
         }
-        if self.n_sub_options:
-            last_obs = deepcopy(obs)  # which the environment may overwrite
-            seen = dict(zip(observe, observations, strict=False)) | {0: self._last_obs, len(rewards): last_obs}
-            info["sub_options"] = self._sub_options(slices, trajectory, rewards, seen, terminated, truncated)
-            self._last_obs = last_obs
-        return obs, float(rewards.sum()) if self.reward == "sum" else integral, terminated, truncated, info
+        if seen is not None:
+            steps = [0, *observe[: len(observations)], n_ran]
+            info["sub_options"] = self._sub_options(slices, trajectory, rewards, seen, steps, terminated, truncated)
+            self._last_obs = _at(seen, -1)
+        return obs, total if self.reward == "sum" else integral, terminated, truncated, info
 
     def plan(self, option: np.ndarray) -> np.ndarray:
         """All primitive actions of an option, in the inner environment's units.
@@ -290,62 +318,53 @@ class OptionExecutionWrapper(gym.Wrapper, RecordConstructorArgs):
         :return: shape ``[n_steps, *action_shape]``
         """
         omega, n_steps = self.option_settings.decode(np.clip(option, -1.0, 1.0))
-        return self._primitive(action_plan(omega, n_steps))
-
-    def _primitive(self, trajectory: np.ndarray) -> np.ndarray:
-        return primitive_actions(trajectory, self.primitive_action_space.low, self.primitive_action_space.high)
+        return self._box.actions(action_plan(omega, n_steps))
 
     def _draw_slices(self, n_steps: int) -> list[tuple[int, int]]:
         """Random stretches ``(first step, step after the last)`` of an option, of at least ``d_min``, not all of it."""
-        settings = self.option_settings
-        shortest = math.ceil(settings.d_min / settings.dt - 1e-6)
-        if self.n_sub_options == 0 or n_steps <= shortest:
+        if self.n_sub_options == 0 or n_steps <= self._shortest:
             return []
         pairs = self._slice_rng.integers(0, n_steps + 1, size=(self.n_sub_options, 2))
         pairs.sort(axis=1)
-        lengths = pairs[:, 1] - pairs[:, 0]
-        return [(int(a), int(b)) for a, b in pairs[(lengths >= shortest) & (lengths < n_steps)]]
+        return [(first, end) for first, end in pairs.tolist() if self._shortest <= end - first < n_steps]
 
     def _sub_options(
         self,
         slices: list[tuple[int, int]],
         trajectory: np.ndarray,
         rewards: np.ndarray,
-        observations: dict[int, Any],
+        seen: Stacked,
+        steps: list[int],
         terminated: bool,
         truncated: bool,
     ) -> SubOptions:
-        """Make transitions of the slices; at the episode's end they end with it, or are dropped."""
+        """Make transitions of the slices; at the episode's end they end with it, or are dropped.
+
+        :param steps: after how many steps of the option each row of ``seen`` was observed
+        """
         settings, n_ran = self.option_settings, len(rewards)
-        kept, weights, residuals = [], [], []
-        for first, last in slices:
-            end = min(last, n_ran)
-            # Both are the same where the episode's end has cut off too much.
-            if (end - first) * settings.dt < settings.d_min - 1e-9:
-                continue
-            omega, residual = fit_weights(trajectory[first:end], settings.n_rbf)
-            if residual <= self.sub_option_tolerance:
-                kept.append((first, end))
-                weights.append(omega)
-                residuals.append(residual)
-        ends = np.array(kept, dtype=np.int64).reshape(-1, 2)
+        if n_ran < len(trajectory):
+            cut_off = [(first, min(end, n_ran)) for first, end in slices]
+            slices = [(first, end) for first, end in cut_off if end - first >= self._shortest]
+        omega, residuals = fit_slices(trajectory, slices, settings.n_rbf)
+        kept = residuals <= self.sub_option_tolerance
+        firsts, ends = np.array(slices, dtype=np.int64).reshape(-1, 2)[kept].T
         # R of a stretch from the discounted rewards up to its ends
+        discounts = discounts_of_steps(n_ran, settings.dt, settings.discount_rate)
+        total = np.zeros(n_ran + 1)
+        np.cumsum(rewards * discounts, out=total[1:])
         weight = step_weight(settings.dt, settings.discount_rate) if self.reward_unit == "rate" else 1.0
-        discounted = rewards * discount(np.arange(n_ran) * settings.dt, settings.discount_rate)
-        total = np.append(0.0, np.cumsum(discounted)) * weight
-        integrals = (total[ends[:, 1]] - total[ends[:, 0]]) / discount(ends[:, 0] * settings.dt, settings.discount_rate)
-        at_end = ends[:, 1] == n_ran
+        at_end = ends == n_ran
         return SubOptions(
-            observations=[observations[first] for first, _ in kept],
-            next_observations=[observations[end] for _, end in kept],
-            options=settings.encode(
-                np.array(weights).reshape(len(kept), self.action_space.shape[0] - 1), ends[:, 1] - ends[:, 0]
-            ),
-            durations=(ends[:, 1] - ends[:, 0]) * settings.dt,
-            integrated_rewards=integrals,
+            seen=seen,
+            begins=np.searchsorted(steps, firsts),
+            ends=np.searchsorted(steps, ends),
+            options=settings.encode(omega[kept].reshape(len(firsts), self.action_space.shape[0] - 1), ends - firsts),
+            durations=(ends - firsts) * settings.dt,
+            integrated_rewards=(total[ends] - total[firsts]) * weight / discounts[firsts],
             terminated=at_end & terminated,
             truncated=at_end & truncated,
-            residuals=np.array(residuals),
+            residuals=residuals[kept],
         )
 
     def _step_in_a_loop(self, actions: np.ndarray, observe: Sequence[int] = ()) -> SequenceResult:
@@ -363,7 +382,7 @@ class OptionExecutionWrapper(gym.Wrapper, RecordConstructorArgs):
                 break
             observations.append(deepcopy(obs))
         if observe:
-            info["observations"] = observations
+            info["observations"] = observations[: len(observe)]
         return obs, rewards, terminated, truncated, info
 
 

@@ -109,7 +109,7 @@ class _OptionStorage(ReplayBuffer):
         ):
             if isinstance(stored, dict):
                 for key in stored:
-                    stored[key][rows, 0] = [value[key] for value in values]
+                    stored[key][rows, 0] = values[key]
             else:
                 stored[rows, 0] = values
         self.actions[rows, 0] = sub_options.options

@@ -353,11 +353,7 @@ class OptionOffPolicyAlgorithm(OffPolicyAlgorithm):
         transpose = unwrap_vec_wrapper(self.env, VecTransposeImage)
         if transpose is None:
             return sub_options
-        return dataclasses.replace(
-            sub_options,
-            observations=[transpose.transpose_observations(obs) for obs in sub_options.observations],
-            next_observations=[transpose.transpose_observations(obs) for obs in sub_options.next_observations],
-        )
+        return dataclasses.replace(sub_options, seen=transpose.transpose_observations(sub_options.seen))
 
     def dump_logs(self) -> None:
         """Write log data; also the durations of options, their mean and the decision rate since the last time."""

@@ -1,6 +1,5 @@
 """Every task of dm_control's suite at any control period, as a Gymnasium environment that can play whole options."""
 
-import itertools
 import math
 import warnings
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -12,6 +11,7 @@ from gymnasium import spaces
 
 try:
     import mujoco
+    from mujoco.rollout import Rollout
 
     with warnings.catch_warnings():
         # Without a display glfw warns, though nothing here needs a window.
@@ -21,7 +21,12 @@ try:
 except ImportError as error:  # pragma: no cover
     raise ImportError("this environment needs dm_control: pip install 'sb3-ctco[dm-control]'") from error
 
-Reward = Callable[[], float]
+#: Rewards ``[n_steps]`` from the qpos, sensordata and ctrl that steps led to, ``[n_steps, ...]`` each
+Rewards = Callable[[np.ndarray, np.ndarray, np.ndarray], np.ndarray]
+
+#: Rewards of the steps that ran, dm_control's discount if the episode ended, and the observations on the way
+_Played = tuple[np.ndarray, float | None, Sequence[np.ndarray]]
+_STATE = int(mujoco.mjtState.mjSTATE_FULLPHYSICS)
 
 
 class DMControlEnv(gym.Env[np.ndarray, np.ndarray]):
@@ -90,13 +95,10 @@ class DMControlEnv(gym.Env[np.ndarray, np.ndarray]):
         self._step_limit = limit if math.isinf(limit) else max(1, round(limit / self.dt))
         self._steps_left: float = 0
 
-        make_reward = _SPARSE_REWARDS.get(domain) if sparse else _FAST_REWARDS.get((domain, task))
-        self._reward: Reward = (
-            make_reward(self._model, self._data) if make_reward else lambda: self._task.get_reward(self._physics)
-        )
-
-        first_joint = _JOINT_OBSERVATIONS.get((domain, task))
-        self._joints = None if first_joint is None else (self._data.qpos[first_joint:], self._data.qvel)
+        make_rewards = _SPARSE_REWARDS.get(domain) if sparse else _REWARDS.get((domain, task))
+        self._rewards: Rewards | None = make_rewards(self._model, self._data) if make_rewards else None
+        self._first_joint = _FIRST_JOINTS.get(domain, 0)
+        self._rollout = Rollout(nthread=0)
 
         spec = env.action_spec()
         # dm_control stands in 1e10 for "no limit".
@@ -139,43 +141,78 @@ class DMControlEnv(gym.Env[np.ndarray, np.ndarray]):
         """
         if self._steps_left < 1:
             raise gym.error.ResetNeeded("call reset() first: the environment was not reset, or its episode has ended")
-        model, data, n_more, rk4 = self._model, self._data, self._n_sub_steps - 1, self._uses_rk4
-        step, step1, step2, reward = mujoco.mj_step, mujoco.mj_step1, mujoco.mj_step2, self._reward
-        get_termination, physics, ctrl = self._task.get_termination, self._physics, data.ctrl
         steps_left, self._steps_left = self._steps_left, 0
-        discount = None
-        rewards: list[float] = []
-        observations = []
+        actions = actions[: int(min(steps_left, len(actions)))]
+        observe = [k for k in observe if k < len(actions)]
+        play = self._step_in_a_loop if self._rewards is None else self._roll_out
         try:
-            with physics.check_invalid_state():
-                for first, last in itertools.pairwise((0, *observe, len(actions))):
-                    for action in actions[first:last]:
-                        ctrl[:] = action
-                        # dm_control's legacy step: mj_step1 at the end leaves positions and velocities in sync.
-                        if rk4:
-                            step(model, data, n_more + 1)
-                        else:
-                            step2(model, data)
-                            if n_more:
-                                step(model, data, n_more)
-                        step1(model, data)
-                        rewards.append(reward())
-                        discount = get_termination(physics)
-                        if discount is not None or len(rewards) >= steps_left:
-                            break
-                    if discount is not None or len(rewards) >= steps_left:
-                        break
-                    if last < len(actions):
-                        observations.append(self._flat_observation())
+            with self._physics.check_invalid_state():
+                rewards, discount, observations = play(actions, observe)
         except PhysicsError as error:
-            raise PhysicsError(f"{error} (within {len(rewards)} steps of {self.dt} s)") from error
+            raise PhysicsError(f"{error} (within {len(actions)} steps of {self.dt} s)") from error
         steps_left -= len(rewards)
-        terminated = discount is not None and discount == 0
+        terminated = discount == 0
         truncated = not terminated and (discount is not None or steps_left < 1)
         if not (terminated or truncated):
             self._steps_left = steps_left
         info = {"observations": observations} if observe else {}
-        return self._flat_observation(), np.array(rewards, dtype=np.float64), terminated, truncated, info
+        return self._flat_observation(), rewards, terminated, truncated, info
+
+    def _step_in_a_loop(self, actions: np.ndarray, observe: Sequence[int]) -> _Played:
+        """Any task, by dm_control's own functions."""
+        model, data, n_more, rk4 = self._model, self._data, self._n_sub_steps - 1, self._uses_rk4
+        task, physics, ctrl = self._task, self._physics, data.ctrl
+        rewards: list[float] = []
+        observations: list[np.ndarray] = []
+        for action in actions:
+            if len(rewards) in observe:
+                observations.append(self._flat_observation())
+            ctrl[:] = action
+            # dm_control's legacy step: mj_step1 at the end leaves positions and velocities in sync.
+            if rk4:
+                mujoco.mj_step(model, data, n_more + 1)
+            else:
+                mujoco.mj_step2(model, data)
+                if n_more:
+                    mujoco.mj_step(model, data, n_more)
+            mujoco.mj_step1(model, data)
+            rewards.append(task.get_reward(physics))
+            discount = task.get_termination(physics)
+            if discount is not None:
+                break
+        return np.array(rewards, dtype=np.float64), discount, observations
+
+    def _roll_out(self, actions: np.ndarray, observe: Sequence[int]) -> _Played:
+        """The same for tasks whose reward is a function of arrays, and whose episodes do not terminate: all in C.
+
+        mj_step is mj_step1, then mj_step2: stepping from positions and velocities that are in sync, as the legacy step
+        leaves them, repeats mj_step1 once and is otherwise the same.
+        """
+        model, data, n_sub_steps = self._model, self._data, self._n_sub_steps
+        ctrl = np.repeat(np.asarray(actions, dtype=np.float64)[None], n_sub_steps, axis=1)
+        start = np.empty((1, mujoco.mj_stateSize(model, _STATE)))
+        mujoco.mj_getState(model, data, start[0], _STATE)
+        states = np.empty((1, ctrl.shape[1], start.shape[1]))
+        # The sensors of a step are those of the state that it starts in; the last state's are read from the data.
+        sensors = np.empty((1, ctrl.shape[1] + 1, model.nsensordata))
+        self._rollout.rollout(
+            [model],
+            [data],
+            start,
+            ctrl,
+            skip_checks=True,
+            nstep=ctrl.shape[1],
+            initial_warmstart=data.qacc_warmstart[None].copy(),
+            state=states,
+            sensordata=sensors[:, :-1],
+        )
+        mujoco.mj_step1(model, data)
+        sensors[0, -1] = data.sensordata
+        # A full state is time, qpos, qvel, …
+        joints = states[0, n_sub_steps - 1 :: n_sub_steps, 1 : 1 + model.nq + model.nv]
+        assert self._rewards is not None
+        rewards = self._rewards(joints[:, : model.nq], sensors[0, n_sub_steps::n_sub_steps], ctrl[0, ::n_sub_steps])
+        return rewards, None, joints[[k - 1 for k in observe], self._first_joint :].astype(np.float32)
 
     def render(self) -> np.ndarray | None:  # type: ignore[override]
         """A frame, uint8 ``[height, width, 3]``, if ``render_mode`` is ``"rgb_array"``."""
@@ -186,8 +223,9 @@ class DMControlEnv(gym.Env[np.ndarray, np.ndarray]):
         self._physics.free()
 
     def _flat_observation(self) -> np.ndarray:
-        if self._joints is not None:
-            return np.concatenate(self._joints, dtype=np.float32, casting="same_kind")
+        if self._rewards is not None:
+            joints = (self._data.qpos[self._first_joint :], self._data.qvel)
+            return np.concatenate(joints, dtype=np.float32, casting="same_kind")
         leaves = [np.ravel(value) for value in _leaves(self._task.get_observation(self._physics))]
         return np.concatenate(leaves, dtype=np.float32, casting="same_kind")
 
@@ -200,69 +238,67 @@ def _leaves(observation: Mapping[str, Any]) -> Iterator[Any]:
             yield value
 
 
-# Rewards and observations of the paper's tasks read from mujoco's arrays: the same numbers as dm_control's own functions,
-# whose named indexing takes several times as long as the physics.
+# Rewards of the paper's tasks as functions of mujoco's arrays: the same numbers as dm_control's own, whose named indexing
+# takes several times as long as the physics. The observations of these tasks are the joints' positions and velocities.
 
 
-def _sparse_point_mass(model: mujoco.MjModel, data: mujoco.MjData) -> Reward:
-    target, mass = model.geom("target").id, model.geom("pointmass").id
-    target_pos, mass_pos = data.geom_xpos[target], data.geom_xpos[mass]
-    size = float(model.geom_size[target, 0])
-
-    def reward() -> float:
-        return 1.0 if math.dist(target_pos, mass_pos) <= size else 0.0
-
-    return reward
+def _sparse_point_mass(model: mujoco.MjModel, data: mujoco.MjData) -> Rewards:
+    distances, size = _distances_to_target(model, data)
+    return lambda qpos, sensors, ctrl: (distances(qpos) <= size).astype(np.float64)
 
 
-def _point_mass(model: mujoco.MjModel, data: mujoco.MjData) -> Reward:
-    target, mass = model.geom("target").id, model.geom("pointmass").id
-    target_pos, mass_pos, ctrl = data.geom_xpos[target], data.geom_xpos[mass], data.ctrl
-    size = float(model.geom_size[target, 0])
+def _point_mass(model: mujoco.MjModel, data: mujoco.MjData) -> Rewards:
+    distances, size = _distances_to_target(model, data)
 
-    def reward() -> float:
+    def rewards(qpos: np.ndarray, sensors: np.ndarray, ctrl: np.ndarray) -> np.ndarray:
         # dm_control's tolerance: Gaussian outside the target, 0.1 one target's size away from it.
-        outside = max(math.dist(target_pos, mass_pos) - size, 0.0) / size
-        small_control = sum(max(1.0 - u * u, 0.0) for u in ctrl.tolist()) / len(ctrl)
+        outside = np.maximum(distances(qpos) - size, 0.0) / size
+        small_control = np.maximum(1.0 - ctrl * ctrl, 0.0).mean(axis=1)
         return 0.1 ** (outside * outside) * (small_control + 4.0) / 5.0
 
-    return reward
+    return rewards
 
 
-def _cheetah_run(model: mujoco.MjModel, data: mujoco.MjData) -> Reward:
-    speed = data.sensor("torso_subtreelinvel").data
+def _distances_to_target(model: mujoco.MjModel, data: mujoco.MjData) -> tuple[Callable[[np.ndarray], np.ndarray], float]:
+    """From qpos ``[n, nq]`` to the distances of the mass from the middle of the target, ``[n]``, and the target's size."""
+    target, mass = model.geom("target").id, model.geom("pointmass").id
+    slopes = _jacobian(mujoco.mj_jacGeom, model, data, mass)
+    origin = data.geom_xpos[mass] - slopes @ data.qpos - data.geom_xpos[target]
 
-    def reward() -> float:
-        return min(max(float(speed[0]) / 10.0, 0.0), 1.0)
+    def distances(qpos: np.ndarray) -> np.ndarray:
+        offset = origin + qpos @ slopes.T
+        return np.sqrt((offset * offset).sum(axis=1))
 
-    return reward
-
-
-def _ball_in_cup_catch(model: mujoco.MjModel, data: mujoco.MjData) -> Reward:
-    target = model.site("target").id
-    target_pos, ball_pos = data.site_xpos[target], data.xpos[model.body("ball").id]
-    ball_size = float(model.geom("ball").size[0])
-    x_max = float(model.site_size[target, 0]) - ball_size
-    z_max = float(model.site_size[target, 2]) - ball_size
-
-    def reward() -> float:
-        inside = abs(target_pos[0] - ball_pos[0]) < x_max and abs(target_pos[2] - ball_pos[2]) < z_max
-        return 1.0 if inside else 0.0
-
-    return reward
+    return distances, float(model.geom_size[target, 0])
 
 
-#: Tasks that observe the joints' positions, from some joint on, and velocities: which joint, by task
-_JOINT_OBSERVATIONS = {
-    ("point_mass", "easy"): 0,
-    ("point_mass", "hard"): 0,
-    ("cheetah", "run"): 1,
-    ("ball_in_cup", "catch"): 0,
-}
-_FAST_REWARDS = {
+def _cheetah_run(model: mujoco.MjModel, data: mujoco.MjData) -> Rewards:
+    speed = model.sensor("torso_subtreelinvel").adr[0]
+    return lambda qpos, sensors, ctrl: (sensors[:, speed] / 10.0).clip(0.0, 1.0)
+
+
+def _ball_in_cup_catch(model: mujoco.MjModel, data: mujoco.MjData) -> Rewards:
+    target, ball = model.site("target").id, model.body("ball").id
+    slopes = _jacobian(mujoco.mj_jacSite, model, data, target) - _jacobian(mujoco.mj_jacBody, model, data, ball)
+    origin = data.site_xpos[target] - data.xpos[ball] - slopes @ data.qpos
+    x_and_z = [0, 2]
+    origin, slopes, limit = origin[x_and_z], slopes[x_and_z], model.site_size[target, x_and_z] - model.geom("ball").size[0]
+    return lambda qpos, sensors, ctrl: (np.abs(origin + qpos @ slopes.T) < limit).all(axis=1).astype(np.float64)
+
+
+def _jacobian(jac: Callable[..., None], model: mujoco.MjModel, data: mujoco.MjData, index: int) -> np.ndarray:
+    """How a position moves with the joints, ``[3, nv]``: a constant where all joints are slides."""
+    slopes = np.empty((3, model.nv))
+    jac(model, data, slopes, None, index)
+    return slopes
+
+
+_REWARDS = {
     ("point_mass", "easy"): _point_mass,
     ("point_mass", "hard"): _point_mass,
     ("cheetah", "run"): _cheetah_run,
     ("ball_in_cup", "catch"): _ball_in_cup_catch,
 }
 _SPARSE_REWARDS = {"point_mass": _sparse_point_mass, "ball_in_cup": _ball_in_cup_catch}
+#: The first joint whose position is observed; cheetah does not observe how far it has run.
+_FIRST_JOINTS = {"cheetah": 1}
