@@ -507,6 +507,15 @@ def test_the_policy_alone_can_be_saved(random_walk_env, tmp_path):
     np.testing.assert_array_equal(policy.predict(obs, deterministic=True)[0], model.predict(obs, deterministic=True)[0])
 
 
+def test_actors_and_critic_of_different_sizes(random_walk_env):
+    policy = make(random_walk_env(), policy_kwargs={"net_arch": {"pi": [6, 5], "vf": [9]}}).policy
+    for networks in (policy.master, policy.option_means, policy.terminations):
+        assert [layer.weight.shape[-1] for layer in networks[::2]][:-1] == [6, 5]
+    assert [layer.weight.shape[-1] for layer in policy.q_network[::2]][:-1] == [9]
+    with pytest.raises(ValueError, match=r"net_arch must be a list of sizes, or dict\(pi=..., vf=...\)"):
+        make(random_walk_env(), policy_kwargs={"net_arch": {"pi": [6]}})
+
+
 # --- learning
 
 

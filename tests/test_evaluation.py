@@ -161,3 +161,17 @@ def test_tensorboard_has_a_histogram_of_durations(tmp_path):
         assert histogram.sum == pytest.approx(10.0)
         assert 0.05 - 1e-6 <= histogram.min < histogram.max <= 0.4 + 1e-6
     assert "option/duration_mean" in events.Tags()["scalars"]
+
+
+def test_a_policy_with_a_memory_gets_it_back(scripted_env):
+    """Such as DAC-PPO, whose state is the current option."""
+
+    class Counter(Scripted):
+        def predict(self, observation, state=None, episode_start=None, deterministic=False):
+            state = (np.where(episode_start, 0, 0 if state is None else state[0]) + 1,)
+            seen.append(int(state[0][0]))
+            return super().predict(observation)[0], state
+
+    seen: list[int] = []
+    evaluate_discounted_return(Counter([0.0]), scripted_env(truncate_at=3), 2, dt=0.1)
+    assert seen == [1, 2, 3, 1, 2, 3]

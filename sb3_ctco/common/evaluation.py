@@ -177,8 +177,11 @@ def evaluate_discounted_return(
     recorder = _ActionRecorder(env) if smoothness else None
     episodes: list[EpisodeStatistics] = []
     obs = env.reset()
+    # Of policies with a memory, such as DAC-PPO's current option
+    state: tuple[np.ndarray, ...] | None = None
+    dones = np.ones(env.num_envs, dtype=bool)
     while len(episodes) < n_eval_episodes:
-        actions, _ = model.predict(obs, deterministic=deterministic)  # type: ignore[arg-type]
+        actions, state = model.predict(obs, state=state, episode_start=dones, deterministic=deterministic)  # type: ignore[arg-type]
         obs, rewards, dones, infos = env.step(actions)
         ended = tracker.step(rewards, dones, infos)
         if recorder is not None:

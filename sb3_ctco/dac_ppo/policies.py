@@ -2,7 +2,7 @@
 
 import math
 from functools import cached_property
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 import torch as th
@@ -93,7 +93,8 @@ class DACPolicy(BasePolicy):
     :param observation_space: observation space
     :param action_space: action space, a ``Box`` with finite bounds
     :param lr_schedule: learning rate schedule
-    :param net_arch: sizes of the hidden layers of each body
+    :param net_arch: sizes of the hidden layers of each body, or ``dict(pi=..., vf=...)``: π_W's, the options' and their
+        terminations', and q's
     :param activation_fn: activation function
     :param ortho_init: whether to initialise orthogonally
     :param n_options: K
@@ -102,7 +103,7 @@ class DACPolicy(BasePolicy):
     :param normalize_images: whether to divide images by 255
     :param optimizer_class: the optimizer to use
     :param optimizer_kwargs: its keyword arguments, without the learning rate; Adam runs fused with ``eps=1e-5`` by default
-    :raises ValueError: if there is less than one option, or gSDE is asked for
+    :raises ValueError: if there is less than one option, ``net_arch`` is malformed, or gSDE is asked for
     """
 
     action_space: spaces.Box
@@ -112,7 +113,7 @@ class DACPolicy(BasePolicy):
         observation_space: spaces.Space,
         action_space: spaces.Box,
         lr_schedule: Schedule,
-        net_arch: list[int] | None = None,
+        net_arch: list[int] | dict[str, list[int]] | None = None,
         activation_fn: type[nn.Module] = nn.Tanh,
         ortho_init: bool = True,
         n_options: int = 4,
@@ -140,6 +141,8 @@ class DACPolicy(BasePolicy):
             normalize_images=normalize_images,
         )
         self.net_arch = [64, 64] if net_arch is None else net_arch
+        if isinstance(self.net_arch, dict) and set(self.net_arch) != {"pi", "vf"}:
+            raise ValueError(f"net_arch must be a list of sizes, or dict(pi=..., vf=...) of such, not {net_arch}")
         self.activation_fn = activation_fn
         self.ortho_init = ortho_init
         self.n_options = n_options
@@ -147,20 +150,20 @@ class DACPolicy(BasePolicy):
 
         self.features_extractor = self.make_features_extractor()
         #: log π_W up to a constant
-        self.master = self._networks(1, n_options, 0.01)
-        self.q_network = self._networks(1, n_options, 1.0)
-        self.option_means = self._networks(n_options, self.action_dim, 0.01)
-        self.terminations = self._networks(n_options, 1, 0.01)
+        self.master = self._networks("pi", 1, n_options, 0.01)
+        self.q_network = self._networks("vf", 1, n_options, 1.0)
+        self.option_means = self._networks("pi", n_options, self.action_dim, 0.01)
+        self.terminations = self._networks("pi", n_options, 1, 0.01)
         self.raw_stds = nn.Parameter(th.zeros(n_options, self.action_dim))
         if ortho_init:
             self.features_extractor.apply(lambda module: self.init_weights(module, math.sqrt(2)))
         self.optimizer = optimizer_class(self.parameters(), lr=lr_schedule(1), **self.optimizer_kwargs)  # type: ignore[call-arg]
 
-    def _networks(self, n_members: int, n_outputs: int, head_gain: float) -> nn.Sequential:
+    def _networks(self, kind: Literal["pi", "vf"], n_members: int, n_outputs: int, head_gain: float) -> nn.Sequential:
         """Networks of one shape, evaluated together."""
         layers: list[nn.Module] = []
         in_features = self.features_extractor.features_dim
-        for out_features in self.net_arch:
+        for out_features in self.net_arch[kind] if isinstance(self.net_arch, dict) else self.net_arch:
             layers += [EnsembleLinear(n_members, in_features, out_features), self.activation_fn()]
             in_features = out_features
         layers.append(EnsembleLinear(n_members, in_features, n_outputs))

@@ -1,0 +1,333 @@
+"""Figures and tables of a study's records."""
+
+import csv
+import math
+from collections import defaultdict
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from sb3_ctco.options import DEFAULT_DISCOUNT_RATE
+from sb3_ctco.study.grid import ALGORITHMS, TASKS
+from sb3_ctco.study.records import Record, paper_returns, read_records
+from sb3_ctco.study.runs import MONITOR, SETTINGS
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+ALGORITHM_NAMES = {"ctco": "CTCO", "sac": "SAC", "figar_sac": "FiGAR-SAC", "dac_ppo": "DAC-PPO"}
+TASK_NAMES = {"point_mass": "sparse point mass", "cheetah": "cheetah run", "ball_in_cup": "ball in cup"}
+METRICS = {
+    "discounted_return": "discounted return,\ntraining episodes of the last tenth",
+    "greedy_return": "discounted return,\ngreedy episodes",
+    "decision_rate_hz": "decisions a second,\ntraining episodes of the last tenth",
+}
+_COLOURS = dict(zip(ALGORITHMS, ("C0", "C1", "C2", "C3"), strict=True))
+_DASHES = ("-", "-.", ":")
+#: Resamples of the bootstrap, as many as rliable's authors take for figures
+_BOOTSTRAP_REPETITIONS = 2000
+#: Training episodes that a point of a learning curve is the mean of
+_CURVE_EPISODES = 12
+
+#: An algorithm and its setting, which is a line of a figure
+Line = tuple[str, str]
+
+
+def mean_and_interval(values: Sequence[float]) -> tuple[float, float]:
+    """Mean over seeds, and half the width of its 95 % interval (Student's t; nan for one seed)."""
+    from scipy.stats import t  # noqa: PLC0415
+
+    n = len(values)
+    half_width = float(t.ppf(0.975, n - 1)) * float(np.std(values, ddof=1)) / math.sqrt(n) if n > 1 else math.nan
+    return float(np.mean(values)), half_width
+
+
+def by_line(records: Sequence[Record], task: str, metric: str) -> dict[Line, dict[int, list[float]]]:
+    """A metric of one task, by algorithm and setting, then by rate in Hz: one value a seed."""
+    lines: dict[Line, dict[int, list[float]]] = {line: defaultdict(list) for line in lines_of(records)}
+    for record in records:
+        if record["task"] == task:
+            lines[record["algorithm"], record["setting"]][_rate(record)].append(record[metric])
+    return {line: dict(sorted(rates.items())) for line, rates in lines.items() if rates}
+
+
+def lines_of(records: Sequence[Record]) -> list[Line]:
+    """Algorithms and settings that occur, in a fixed order."""
+    present = {(record["algorithm"], record["setting"]) for record in records}
+    return sorted(present, key=lambda line: (ALGORITHMS.index(line[0]), line[1]))
+
+
+def tasks_of(records: Sequence[Record]) -> list[str]:
+    """Tasks that occur, in the paper's order."""
+    return [task for task in TASKS if any(record["task"] == task for record in records)]
+
+
+def interquartile_means(records: Sequence[Record], metric: str) -> dict[Line, dict[int, tuple[float, float, float]]]:
+    """Interquartile mean over seeds and tasks with its 95 % interval, by rate in Hz, from rliable.
+
+    Scores are returns times τ, that is fractions of the most that a reward of 1 a second can give. A rate needs at least
+    one seed that is complete in all tasks; its interval is that of a bootstrap over seeds within tasks, and nan for one.
+
+    :return: interquartile mean, lower and upper bound
+    """
+    from rliable.library import get_interval_estimates  # noqa: PLC0415
+    from rliable.metrics import aggregate_iqm  # noqa: PLC0415
+
+    tasks = tasks_of(records)
+    values = {
+        (record["algorithm"], record["setting"], _rate(record), record["seed"], record["task"]): record[metric]
+        for record in records
+    }
+    rates = sorted({_rate(record) for record in records})
+    seeds = sorted({record["seed"] for record in records})
+    estimates: dict[Line, dict[int, tuple[float, float, float]]] = {}
+    for line in lines_of(records):
+        for rate in rates:
+            complete = [seed for seed in seeds if all((*line, rate, seed, task) in values for task in tasks)]
+            if not complete:
+                continue
+            scores = np.array([[values[*line, rate, seed, task] for task in tasks] for seed in complete])
+            scores = scores * DEFAULT_DISCOUNT_RATE
+            low = high = math.nan
+            if len(complete) > 1:
+                state = np.random.get_state()
+                np.random.seed(0)  # rliable draws from the global generator.
+                _, interval = get_interval_estimates(
+                    {"": scores}, lambda x: np.array([aggregate_iqm(x)]), reps=_BOOTSTRAP_REPETITIONS
+                )
+                np.random.set_state(state)
+                low, high = (float(bound) for bound in interval[""][:, 0])
+            estimates.setdefault(line, {})[rate] = (float(aggregate_iqm(scores)), low, high)
+    return estimates
+
+
+def draw_metric(records: Sequence[Record], metric: str) -> "Figure":
+    """A metric over the interaction rate: a panel a task, a line an algorithm and setting, and the paper's numbers."""
+    tasks = tasks_of(records)
+    figure, axes = _panels(1, len(tasks))
+    paper = paper_returns() if metric != "decision_rate_hz" else {}
+    lines = lines_of(records)
+    for ax, task in zip(axes[0], tasks, strict=True):
+        for line, rates in by_line(records, task, metric).items():
+            style, label = _style(line, lines)
+            means, half_widths = np.array([mean_and_interval(values) for values in rates.values()]).T
+            _line_with_band(ax, list(rates), means, means - half_widths, means + half_widths, style, label)
+            for rate, values in rates.items():
+                ax.plot([rate] * len(values), values, ".", color=style["color"], markersize=3)
+        for algorithm in ALGORITHMS:
+            if numbers := paper.get((task, algorithm)):
+                label = f"{ALGORITHM_NAMES[algorithm]}, the paper's figure"
+                colour = _COLOURS[algorithm]
+                ax.plot(list(numbers), list(numbers.values()), "--", color=colour, linewidth=0.8, alpha=0.7, label=label)
+        _rate_axis(ax, records)
+        ax.set_title(TASK_NAMES[task])
+        if metric == "decision_rate_hz":
+            ax.set_yscale("log")
+        else:
+            ax.set_ylim(bottom=min(0.0, ax.dataLim.y0))
+    axes[0][0].set_ylabel(METRICS[metric])
+    _legend(figure, axes[0][0], f"mean and 95 % interval of {_seeds(records)}; a dot a seed")
+    return figure
+
+
+def draw_interquartile_means(records: Sequence[Record]) -> "Figure":
+    """Interquartile means over the interaction rate: training episodes and greedy ones."""
+    figure, axes = _panels(1, 2)
+    lines = lines_of(records)
+    for ax, metric in zip(axes[0], ("discounted_return", "greedy_return"), strict=True):
+        for line, rates in interquartile_means(records, metric).items():
+            style, label = _style(line, lines)
+            means, low, high = np.array(list(rates.values())).T
+            _line_with_band(ax, list(rates), means, low, high, style, label)
+        _rate_axis(ax, records)
+        ax.set_title(METRICS[metric].split(",\n")[1])
+        ax.set_ylim(bottom=0.0)
+    axes[0][0].set_ylabel("interquartile mean over tasks and seeds\nof discounted return × τ")
+    _legend(figure, axes[0][0], f"95 % intervals: stratified bootstrap over {_seeds(records)}")
+    return figure
+
+
+def draw_learning_curves(folder: Path) -> "Figure":
+    """Discounted return of training episodes over task time: a row a rate, a column a task; a thin line a run."""
+    import json  # noqa: PLC0415
+
+    curves: dict[tuple[str, int, Line], list[tuple[np.ndarray, np.ndarray]]] = defaultdict(list)
+    for file in sorted(folder.glob(f"*/{MONITOR}")):
+        settings = json.loads((file.parent / SETTINGS).read_text(encoding="utf-8"))
+        curve = _read_curve(file)
+        if curve is not None:
+            line = (settings["algorithm"], settings["setting"])
+            curves[settings["task"], settings["rate"], line].append(curve)
+    tasks = [task for task in TASKS if any(key[0] == task for key in curves)]
+    rates = sorted({key[1] for key in curves})
+    lines = sorted({key[2] for key in curves}, key=lambda line: (ALGORITHMS.index(line[0]), line[1]))
+    figure, axes = _panels(len(rates), len(tasks))
+    for row, rate in zip(axes, rates, strict=True):
+        for ax, task in zip(row, tasks, strict=True):
+            for line in lines:
+                style, label = _style(line, lines)
+                for number, (seconds, returns) in enumerate(curves[task, rate, line]):
+                    ax.plot(seconds / 60, returns, **{**style, "linewidth": 1.0}, label=label if number == 0 else None)
+            ax.set_title(f"{TASK_NAMES[task]}, {rate} Hz")
+            ax.set_ylim(bottom=min(0.0, ax.dataLim.y0))
+        row[0].set_ylabel("discounted return")
+    for ax in axes[-1]:
+        ax.set_xlabel("task time [min]")
+    _legend(figure, axes[0][0], f"a line a seed; mean of {_CURVE_EPISODES} training episodes")
+    return figure
+
+
+def table(records: Sequence[Record]) -> str:
+    """Markdown: returns and decision rates of each task, algorithm and rate, beside the paper's returns."""
+    rates = sorted({_rate(record) for record in records})
+    presets = sorted({f"{record['preset']} ({record['task_seconds']:g} s of task time)" for record in records})
+    commits = sorted({record["commit"] for record in records})
+    parts = [
+        f"Preset {', '.join(presets)}; {_seeds(records)}; commit {', '.join(commits)}. Means over seeds, ± half of the 95 % "
+        "interval (Student's t) where there are at least two.\n"
+    ]
+    for metric, name in METRICS.items():
+        parts.append(f"## {name.replace(chr(10), ' ').capitalize()}\n")
+        parts.append(_row("task", "algorithm", "setting", "seeds", *(f"{rate} Hz" for rate in rates)))
+        parts.append(_row(*["---"] * (4 + len(rates))))
+        for task in tasks_of(records):
+            for (algorithm, setting), values in by_line(records, task, metric).items():
+                numbers = sorted({len(one) for one in values.values()})
+                seeds = "–".join(str(number) for number in {numbers[0]: 0, numbers[-1]: 0})
+                cells = (_cell(values.get(rate, [])) for rate in rates)
+                parts.append(_row(TASK_NAMES[task], ALGORITHM_NAMES[algorithm], setting, seeds, *cells))
+            if metric != "decision_rate_hz":
+                for algorithm in ALGORITHMS:
+                    numbers_of_paper = paper_returns()[task, algorithm]
+                    cells = (f"{numbers_of_paper[rate]:.2f}" for rate in rates)
+                    parts.append(_row(TASK_NAMES[task], ALGORITHM_NAMES[algorithm], "*the paper's figure*", "30", *cells))
+        parts.append("")
+    parts.append("## Interquartile means\n")
+    parts.append(
+        "Over tasks and seeds, of discounted return × τ (a fraction of the most that a reward of 1 a second can give), with "
+        "95 % intervals of rliable's stratified bootstrap where there are at least two seeds.\n"
+    )
+    parts.append(_row("episodes", "algorithm", "setting", *(f"{rate} Hz" for rate in rates)))
+    parts.append(_row(*["---"] * (3 + len(rates))))
+    for metric, name in (("discounted_return", "training"), ("greedy_return", "greedy")):
+        for (algorithm, setting), estimates in interquartile_means(records, metric).items():
+            cells = (_interval_cell(estimates.get(rate)) for rate in rates)
+            parts.append(_row(name, ALGORITHM_NAMES[algorithm], setting, *cells))
+    return "\n".join(parts) + "\n"
+
+
+def plot(source: Path, output: Path) -> list[Path]:
+    """Draw everything that a study's folder, or a CSV file of its records, has the data for.
+
+    :param source: the folder or file; a file has no learning curves
+    :param output: folder for figures (PNG and SVG) and ``table.md``
+    :return: the files written
+    """
+    import matplotlib as mpl  # noqa: PLC0415
+
+    mpl.use("Agg")
+    import matplotlib.pyplot as plt  # noqa: PLC0415
+
+    # Text as text, and the same bytes for the same records.
+    mpl.rcParams.update({"svg.fonttype": "none", "svg.hashsalt": "sb3-ctco"})
+    records = read_records(source)
+    output.mkdir(parents=True, exist_ok=True)
+    figures = {
+        "frequency": draw_metric(records, "discounted_return"),
+        "frequency_greedy": draw_metric(records, "greedy_return"),
+        "decision_rates": draw_metric(records, "decision_rate_hz"),
+        "interquartile_means": draw_interquartile_means(records),
+    }
+    if source.is_dir():
+        figures["learning_curves"] = draw_learning_curves(source)
+    written = []
+    for name, figure in figures.items():
+        for ending, metadata in (("png", None), ("svg", {"Date": None})):
+            written.append(output / f"{name}.{ending}")
+            figure.savefig(written[-1], dpi=120, metadata=metadata)
+        plt.close(figure)
+    written.append(output / "table.md")
+    written[-1].write_text(table(records), encoding="utf-8")
+    return written
+
+
+def _rate(record: Record) -> int:
+    return round(1.0 / record["dt"])
+
+
+def _seeds(records: Sequence[Record]) -> str:
+    n = len({record["seed"] for record in records})
+    return f"{n} seed{'s' * (n > 1)}"
+
+
+def _read_curve(file: Path) -> tuple[np.ndarray, np.ndarray] | None:
+    """Task time in s and smoothed return of a run's training episodes; None if there are too few."""
+    with file.open(newline="") as stream:
+        rows = [row for row in csv.DictReader(stream) if row["wall_seconds"]]
+    if len(rows) < 2:
+        return None
+    seconds = np.array([float(row["task_seconds"]) for row in rows])
+    returns = np.array([float(row["discounted_return"]) for row in rows])
+    window = min(_CURVE_EPISODES, len(rows) // 2)
+    return seconds[window - 1 :], np.convolve(returns, np.ones(window) / window, mode="valid")
+
+
+def _panels(n_rows: int, n_columns: int) -> tuple["Figure", np.ndarray]:
+    import matplotlib.pyplot as plt  # noqa: PLC0415
+
+    size = (4.0 * n_columns, 2.6 * n_rows + 1.2)
+    return plt.subplots(n_rows, n_columns, figsize=size, squeeze=False, layout="constrained")
+
+
+def _style(line: Line, lines: Sequence[Line]) -> tuple[dict[str, Any], str]:
+    algorithm, setting = line
+    settings = [other for name, other in lines if name == algorithm]
+    style = {"color": _COLOURS[algorithm], "linestyle": _DASHES[settings.index(setting) % len(_DASHES)]}
+    return style, f"{ALGORITHM_NAMES[algorithm]} ({setting})"
+
+
+def _line_with_band(
+    ax: "Axes",
+    rates: list[int],
+    means: np.ndarray,
+    low: np.ndarray,
+    high: np.ndarray,
+    style: dict[str, Any],
+    label: str,
+) -> None:
+    ax.plot(rates, means, marker="o", markersize=4, label=label, **style)
+    ax.fill_between(rates, low, high, color=style["color"], alpha=0.15, linewidth=0)
+
+
+def _rate_axis(ax: "Axes", records: Sequence[Record]) -> None:
+    rates = sorted({_rate(record) for record in records})
+    ax.set_xscale("log")
+    ax.set_xticks(rates, [str(rate) for rate in rates])
+    ax.minorticks_off()
+    ax.set_xlabel("interaction frequency [Hz]")
+
+
+def _legend(figure: "Figure", ax: "Axes", title: str) -> None:
+    handles, labels = ax.get_legend_handles_labels()
+    figure.legend(handles, labels, title=title, loc="outside lower center", ncols=4, fontsize="small", title_fontsize="small")
+
+
+def _row(*cells: str) -> str:
+    return f"| {' | '.join(cells)} |"
+
+
+def _cell(values: Sequence[float]) -> str:
+    if not values:
+        return "–"
+    mean, half_width = mean_and_interval(values)
+    return f"{mean:.2f}" if math.isnan(half_width) else f"{mean:.2f} ± {half_width:.2f}"
+
+
+def _interval_cell(estimate: tuple[float, float, float] | None) -> str:
+    if estimate is None:
+        return "–"
+    mean, low, high = estimate
+    return f"{mean:.2f}" if math.isnan(low) else f"{mean:.2f} [{low:.2f}, {high:.2f}]"
