@@ -16,7 +16,15 @@ from sb3_ctco.ctco.ctco import actor_loss, critic_loss, critic_target, duration_
 from sb3_ctco.ctco.policies import CTCOPolicy, EnsembleLinear, squashed_log_prob
 from sb3_ctco.options import DEFAULT_DISCOUNT_RATE, step_weight
 
-SMALL = {"policy_kwargs": {"net_arch": [8]}, "batch_size": 8, "device": "cpu", "seed": 0, "learning_starts": 20}
+# Without sub-options, so that rows of the buffer are the decisions in their order.
+SMALL = {
+    "policy_kwargs": {"net_arch": [8]},
+    "batch_size": 8,
+    "device": "cpu",
+    "seed": 0,
+    "learning_starts": 20,
+    "n_sub_options": 0,
+}
 
 
 def make(env, **kwargs):
@@ -126,9 +134,7 @@ def test_entropy_paid_as_a_rate():
     by_time = make(random_walk_like(), ent_coef=1.0, duration_ent_coef=0.5, entropy_reference="duration")
     options, log_prob = by_time.actor.option_log_prob(th.zeros(8, 2))
     weights = duration_weight(options[:, -1:], 0.1, 1.0, by_time.discount_rate)
-    th.testing.assert_close(
-        by_time.entropy_costs(options, log_prob), weights * by_decision.entropy_costs(options, log_prob)
-    )
+    th.testing.assert_close(by_time.entropy_costs(options, log_prob), weights * by_decision.entropy_costs(options, log_prob))
 
 
 class StaleOptionsEnv(gym.Env):
@@ -195,7 +201,7 @@ def test_the_penalty_is_found_that_keeps_a_decision_rate(decision_rate):
 
 def test_a_decision_rate_is_kept_from_above_only():
     """While options are longer than they need be, the penalty falls, and it never pays to be slower still."""
-    model = make(StaleOptionsEnv(), target_decision_rate=1000.0, learning_rate=0.01).learn(200)
+    model = make(StaleOptionsEnv(), target_decision_rate=1000.0, learning_rate=0.01, high_freq_penalty=0.05).learn(200)
     falling = model._current_high_freq_penalty()
     assert 0.0 < falling < 0.05
     model.target_decision_rate = 0.1
@@ -203,9 +209,20 @@ def test_a_decision_rate_is_kept_from_above_only():
     assert model._current_high_freq_penalty() > falling
 
 
+def test_the_paper_s_algorithm():
+    model = CTCO("MlpPolicy", "Pendulum-v1", **CTCO.paper_defaults(), device="cpu", seed=0, learning_starts=50).learn(100)
+    assert model.critic.n_critics == 1
+    assert [p.shape for p in model.critic.q_networks[2].parameters()] == [(1, 64, 64), (1, 1, 64)]
+    assert model._current_high_freq_penalty() == 0.05
+    assert model.replay_buffer.size() == model.replay_buffer.n_decisions  # and no sub-options
+    th.testing.assert_close(model._log_reference[0], th.tensor(0.0))
+
+
 def test_the_found_penalty_is_logged_saved_and_loaded(tmp_path):
-    model = make(StaleOptionsEnv(), target_decision_rate=3.0, learning_rate=0.01).learn(200)
-    assert model.logger.name_to_value["option/high_freq_penalty"] == pytest.approx(model._current_high_freq_penalty(), rel=0.05)
+    model = make(StaleOptionsEnv(), target_decision_rate=3.0, learning_rate=0.01, high_freq_penalty=0.05).learn(200)
+    assert model.logger.name_to_value["option/high_freq_penalty"] == pytest.approx(
+        model._current_high_freq_penalty(), rel=0.05
+    )
     model.save(tmp_path / "model")
     loaded = CTCO.load(tmp_path / "model", env=StaleOptionsEnv(), device="cpu")
     assert loaded._current_high_freq_penalty() == model._current_high_freq_penalty() != 0.05
@@ -236,7 +253,14 @@ def batch_of(model, n=16):
 
 def test_one_update_by_hand(random_walk_env):
     """The critic's loss that train logs, recomputed from the networks with β_h, γ(d) and both entropies."""
-    model = make(random_walk_env(), learning_starts=1000, learning_rate=0.0, ent_coef=0.2, duration_ent_coef=0.4)
+    model = make(
+        random_walk_env(),
+        learning_starts=1000,
+        learning_rate=0.0,
+        ent_coef=0.2,
+        duration_ent_coef=0.4,
+        high_freq_penalty=0.05,
+    )
     model.learn(200)
     # Let the targets differ from what they follow.
     with th.no_grad():

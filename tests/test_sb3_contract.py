@@ -43,6 +43,8 @@ _SHORT = {
 ALGORITHMS = {CTCO: _SHORT, FiGARSAC: _SHORT}
 #: OptionExecutionWrapper's arguments for each
 WRAPPER: dict[type, dict[str, Any]] = {CTCO: {"d_max": 0.3}, FiGARSAC: {"n_rbf": 1, "d_max": 0.3}}
+#: For frames that are stacked outside, where sub-options cannot be
+WITHOUT_SUB_OPTIONS: dict[type, dict[str, Any]] = {CTCO: {"n_sub_options": 0}, FiGARSAC: {}}
 pytestmark = pytest.mark.parametrize("algorithm", ALGORITHMS, ids=lambda algorithm: algorithm.__name__)
 
 
@@ -337,7 +339,7 @@ def test_dictionaries_normalised_and_stacked(algorithm, tmp_path):
     # VecNormalize outside, as Stable-Baselines3 asks of algorithms with a replay buffer.
     env = VecFrameStack(DummyVecEnv([lambda: wrapped(algorithm, GoalWalk())] * 2), n_stack=3)
     env = VecNormalize(env, norm_obs=True, norm_reward=False, norm_obs_keys=["goal"])
-    model = make(algorithm, env, "MultiInputPolicy").learn(120)
+    model = make(algorithm, env, "MultiInputPolicy", **WITHOUT_SUB_OPTIONS[algorithm]).learn(120)
     assert model.observation_space["position"].shape == (6,)
     normalizer = model.get_vec_normalize_env()
     assert normalizer.obs_rms["goal"].count > 1
@@ -355,7 +357,8 @@ def test_dictionaries_normalised_and_stacked(algorithm, tmp_path):
 def test_images_stacked(algorithm, random_walk_env):
     env = VecFrameStack(DummyVecEnv([lambda: wrapped(algorithm, random_walk_env("image"))]), n_stack=2, channels_order="first")
     kwargs = {"features_extractor_class": TinyCnn}
-    model = make(algorithm, env, "CnnPolicy", buffer_size=100, policy_kwargs=kwargs).learn(40)
+    kwargs = {"policy_kwargs": kwargs, **WITHOUT_SUB_OPTIONS[algorithm]}
+    model = make(algorithm, env, "CnnPolicy", buffer_size=100, **kwargs).learn(40)
     assert model.observation_space.shape == (6, 36, 36)
 
 

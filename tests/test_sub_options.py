@@ -6,6 +6,7 @@ import math
 import gymnasium as gym
 import numpy as np
 import pytest
+from gymnasium.error import ResetNeeded
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.vec_env import SubprocVecEnv, VecFrameStack
@@ -301,9 +302,20 @@ def test_the_ring_goes_round(random_walk_env):
     assert (buffer.durations > 0).all()
 
 
-def test_settings_must_agree(random_walk_env):
-    with pytest.raises(ValueError, match="n_sub_options=2"):
-        make(OptionExecutionWrapper(random_walk_env(), n_sub_options=2))
+def test_the_algorithm_tells_the_environment_how_many(random_walk_env):
+    env = OptionExecutionWrapper(random_walk_env(), n_sub_options=2)
+    env.reset(seed=0)
+    model = make(env, n_sub_options=5)
+    assert env.n_sub_options == 5
+    with pytest.raises(ResetNeeded):
+        env.step(env.action_space.sample())  # whose first observation nobody has kept
+    model.learn(50)
+    assert model.replay_buffer.size() > 2 * model.replay_buffer.n_decisions
+    with pytest.raises(ValueError, match="at least 0, not -1"):
+        env.set_n_sub_options(-1)
+
+
+def test_what_cannot_be_sliced_is_refused(random_walk_env):
     stacked = VecFrameStack(
         make_vec_env(random_walk_env, wrapper_class=OptionExecutionWrapper, wrapper_kwargs={"n_sub_options": 4}), 2
     )

@@ -20,7 +20,8 @@ SMALL = {"policy_kwargs": {"net_arch": [8]}, "batch_size": 8, "device": "cpu", "
 
 
 def make(env, **kwargs):
-    return CTCO("MlpPolicy", env, **{"learning_starts": 10**9, "d_max": 0.6, **SMALL, **kwargs})
+    # Without sub-options, so that the buffer has as many rows as there were decisions.
+    return CTCO("MlpPolicy", env, **{"learning_starts": 10**9, "d_max": 0.6, "n_sub_options": 0, **SMALL, **kwargs})
 
 
 class Recorder(BaseCallback):
@@ -245,7 +246,7 @@ def test_logs(random_walk_env):
     assert last["rollout/ep_len_mean"] == 20
     assert 0.3 <= last["option/duration_mean"] <= 0.6
     assert last["option/decision_rate_hz"] == pytest.approx(1 / last["option/duration_mean"])
-    assert last["option/high_freq_penalty"] == 0.05
+    assert last["option/high_freq_penalty"] == 0.003
     assert last["time/total_timesteps"] == 400
     for name in ("actor_loss", "critic_loss", "ent_coef", "duration_ent_coef", "ent_coef_loss", "n_updates", "learning_rate"):
         assert np.isfinite(last[f"train/{name}"]), name

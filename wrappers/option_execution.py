@@ -212,8 +212,6 @@ class OptionExecutionWrapper(gym.Wrapper, RecordConstructorArgs):
             raise ValueError(f"reward must be 'sum' or 'integral', not {reward!r}")
         if reward_unit not in REWARD_UNITS:
             raise ValueError(f"reward_unit must be one of {REWARD_UNITS}, not {reward_unit!r}")
-        if n_sub_options < 0:
-            raise ValueError(f"n_sub_options must be at least 0, not {n_sub_options}")
         if not sub_option_tolerance >= 0:
             raise ValueError(f"sub_option_tolerance must be at least 0, not {sub_option_tolerance}")
         if dt is None:
@@ -240,7 +238,8 @@ class OptionExecutionWrapper(gym.Wrapper, RecordConstructorArgs):
         )
         self._play: StepSequence | None = None
 
-        self.n_sub_options = n_sub_options
+        self.n_sub_options = 0
+        self.set_n_sub_options(n_sub_options)
         self.sub_option_tolerance = sub_option_tolerance
         self._shortest = math.ceil(self.option_settings.d_min / dt - 1e-6)
         # A generator of its own, so that sub-options change nothing in what the environment does.
@@ -310,6 +309,17 @@ class OptionExecutionWrapper(gym.Wrapper, RecordConstructorArgs):
             info["sub_options"] = self._sub_options(slices, trajectory, rewards, seen, steps, terminated, truncated)
             self._last_obs = _at(seen, -1)
         return obs, total if self.reward == "sum" else integral, terminated, truncated, info
+
+    def set_n_sub_options(self, n_sub_options: int) -> None:
+        """How many sub-options to hand over from now on; after a change the environment must be reset.
+
+        :raises ValueError: if it is negative
+        """
+        if n_sub_options < 0:
+            raise ValueError(f"n_sub_options must be at least 0, not {n_sub_options}")
+        if n_sub_options != self.n_sub_options:
+            self.n_sub_options = n_sub_options
+            self._play = None
 
     def plan(self, option: np.ndarray) -> np.ndarray:
         """All primitive actions of an option, in the inner environment's units.

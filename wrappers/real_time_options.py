@@ -50,11 +50,6 @@ class RealTimeOptionWrapper(OptionExecutionWrapper):
             self, decide_ahead=decide_ahead, interrupt=interrupt, background=background, _disable_deepcopy=True, **kwargs
         )
         super().__init__(env, **kwargs)
-        if self.n_sub_options:
-            raise ValueError(
-                f"n_sub_options={self.n_sub_options} is not possible in real time, where a transition may consist of parts of "
-                "two options: pass n_sub_options=0"
-            )
         if not 0.0 <= decide_ahead < self.option_settings.d_max:
             raise ValueError(
                 f"decide_ahead must be at least 0 s and less than d_max={self.option_settings.d_max} s, not {decide_ahead}"
@@ -68,11 +63,23 @@ class RealTimeOptionWrapper(OptionExecutionWrapper):
         self._decided_on: Any = None
         self._play: StepSequence | None = None
 
+    def set_n_sub_options(self, n_sub_options: int) -> None:
+        """Sub-options are not possible in real time.
+
+        :raises ValueError: if any are asked for
+        """
+        if n_sub_options:
+            raise ValueError(
+                f"n_sub_options={n_sub_options} is not possible in real time, where a transition may consist of parts of "
+                "two options: pass n_sub_options=0"
+            )
+        super().set_n_sub_options(n_sub_options)
+
     @classmethod
     def like(
         cls, wrapper: OptionExecutionWrapper, decide_ahead: float, interrupt: Interrupt | None, background: bool
     ) -> "RealTimeOptionWrapper":
-        """The same wrapper around the same environment, with what this class adds."""
+        """The same wrapper around the same environment, with what this class adds, and without sub-options."""
         settings = wrapper.option_settings
         return cls(
             wrapper.env,
@@ -86,7 +93,6 @@ class RealTimeOptionWrapper(OptionExecutionWrapper):
             discount_rate=settings.discount_rate,
             reward=wrapper.reward,
             reward_unit=wrapper.reward_unit,
-            n_sub_options=wrapper.n_sub_options,
         )
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:

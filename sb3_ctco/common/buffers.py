@@ -109,9 +109,10 @@ class _OptionStorage(ReplayBuffer):
         ):
             if isinstance(stored, dict):
                 for key in stored:
-                    stored[key][rows, 0] = values[key]
+                    stored[key][rows, 0] = values[key].reshape(count, *stored[key].shape[2:])
             else:
-                stored[rows, 0] = values
+                # A discrete observation is a number in the environment, and an array of one here.
+                stored[rows, 0] = values.reshape(count, *stored.shape[2:])
         self.actions[rows, 0] = sub_options.options
         # What primitive steps paid in sum is not kept of a sub-option; samples have R.
         self.rewards[rows, 0] = self.integrated_rewards[rows, 0] = sub_options.integrated_rewards

@@ -61,7 +61,8 @@ class OptionOffPolicyAlgorithm(OffPolicyAlgorithm):
     :param gradient_steps: updates a training; -1 for as many as primitive steps were collected
     :param updates_per_second: updates a second of task time, the paper's "fixed number of updates per time unit",
         in place of ``gradient_steps``; a fraction is carried over
-    :param n_sub_options: how many random stretches of each option go into the replay buffer beside it
+    :param n_sub_options: how many random stretches of each option go into the replay buffer beside it; environments that
+        are wrapped already are told
     :raises ValueError: for settings out of range or contradicting each other or the environment's
     """
 
@@ -192,12 +193,6 @@ class OptionOffPolicyAlgorithm(OffPolicyAlgorithm):
             raise ValueError(
                 "VecNormalize counts its returns per decision, whatever time a decision takes: pass norm_reward=False"
             )
-        for count in env.get_attr("n_sub_options"):
-            if count != self.n_sub_options:
-                raise ValueError(
-                    f"the environment hands over n_sub_options={count}, {type(self).__name__} has "
-                    f"n_sub_options={self.n_sub_options}: give both the same"
-                )
         if self.n_sub_options and unwrap_vec_wrapper(env, VecFrameStack) is not None:
             raise ValueError(
                 "sub-options begin at single observations, which VecFrameStack does not stack: stack frames inside, with "
@@ -226,6 +221,8 @@ class OptionOffPolicyAlgorithm(OffPolicyAlgorithm):
                     f"{self.primitive_action_space or action_spaces[0]}: options mean the same in both only if these agree"
                 )
         self.primitive_action_space = action_spaces[0]
+        # No setting that both must share, but what one wants of the other.
+        env.env_method("set_n_sub_options", self.n_sub_options)
         return settings[0]
 
     def set_env(self, env: GymEnv, force_reset: bool = True) -> None:

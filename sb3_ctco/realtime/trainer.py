@@ -100,7 +100,8 @@ class AsynchronousTrainer(Generic[AlgorithmType]):
         ordinary process delays; needs root or CAP_SYS_NICE. None leaves it to the ordinary scheduler
     :param checkpoint_seconds: between two checkpoints of the learner
     :param decide_ahead: decide on the next option this many seconds before the current one ends, see
-        :class:`~sb3_ctco.wrappers.RealTimeOptionWrapper`; for algorithms with options
+        :class:`~sb3_ctco.wrappers.RealTimeOptionWrapper`; for algorithms with options. With this or ``interrupt`` there are
+        no sub-options: the model's ``n_sub_options`` becomes 0
     :param interrupt: ends an option early, see there; for algorithms with options
     :raises ValueError: for an environment, a model or settings that cannot be right
     :raises FileExistsError: if ``folder`` holds a journal and ``resume`` is not asked for
@@ -165,6 +166,7 @@ class AsynchronousTrainer(Generic[AlgorithmType]):
         wrapped: gym.Env = self._supervisor
         if reactive:
             assert isinstance(model, OptionOffPolicyAlgorithm)
+            model.n_sub_options = 0  # type: ignore[attr-defined]
             wrapped = RealTimeOptionWrapper.like(
                 model.wrap_env(wrapped), decide_ahead=decide_ahead, interrupt=interrupt, background=real_time
             )
