@@ -103,6 +103,7 @@ class _OptionStorage(ReplayBuffer):
         if count == 0:
             return
         rows = (self.pos + np.arange(count)) % self.buffer_size
+        values: Any
         for stored, values in (
             (self.observations, sub_options.observations),
             (self.next_observations, sub_options.next_observations),

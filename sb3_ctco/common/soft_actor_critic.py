@@ -112,10 +112,12 @@ class SoftOptionActorCritic(OptionOffPolicyAlgorithm):
     def _setup_temperatures(self) -> None:
         """Both temperatures and all that belongs to them as vectors ``[2]``: what to do, and the duration."""
         auto_target, auto_duration_target = self._auto_target_entropies()
-        if self.target_entropy == "auto":
-            self.target_entropy = auto_target
-        if self.duration_target_entropy == "auto":
-            self.duration_target_entropy = auto_duration_target
+        if isinstance(self.target_entropy, str):
+            self.target_entropy = _parse_target_entropy("target_entropy", self.target_entropy, auto_target)
+        if isinstance(self.duration_target_entropy, str):
+            self.duration_target_entropy = _parse_target_entropy(
+                "duration_target_entropy", self.duration_target_entropy, auto_duration_target
+            )
         coef, learned = _parse_ent_coef("ent_coef", self.ent_coef)
         duration_coef, duration_learned = _parse_ent_coef("duration_ent_coef", self.duration_ent_coef)
         if self.d_min == self.d_max:
@@ -257,6 +259,17 @@ class SoftOptionActorCritic(OptionOffPolicyAlgorithm):
         if self.ent_coef_optimizer is not None:
             state_dicts.append("ent_coef_optimizer")
         return state_dicts, ["log_ent_coefs"]
+
+
+def _parse_target_entropy(name: str, value: str, auto: float) -> float:
+    """A target entropy that was given as a string.
+
+    :raises ValueError: if it is neither "auto" nor a number
+    """
+    try:
+        return auto if value == "auto" else float(value)
+    except ValueError:
+        raise ValueError(f"{name} must be a number, a function of the remaining progress or 'auto', not {value!r}") from None
 
 
 def _parse_ent_coef(name: str, value: str | float) -> tuple[float, bool]:

@@ -332,12 +332,17 @@ class CTCO(SoftOptionActorCritic):
 
     def _prepare_hand_gradients(self) -> None:
         # Not possible before the first update, with which optimizers get their state.
-        if not HandGradients.possible_for(self):
+        if not (self._has_own_losses() and HandGradients.possible_for(self)):
             self._hand_gradients = None
         elif self._hand_gradients is None or not self._hand_gradients.is_valid():
             self._hand_gradients = HandGradients(self)
         else:
             self._hand_gradients.refresh()
+
+    def _has_own_losses(self) -> bool:
+        """Whether no subclass changed what the gradients were worked out for."""
+        names = ("_sample_policy", "_critic_targets", "_q_values", "_actor_loss", "_update_temperatures", "entropy_costs")
+        return all(getattr(type(self), name) is getattr(CTCO, name) for name in names)
 
     def _update(self, data: ReplayBufferSamples) -> th.Tensor:
         return super()._update(data) if self._hand_gradients is None else self._hand_gradients.update(data)

@@ -18,7 +18,7 @@ from torch import nn
 from torch.nn import functional as F
 
 from sb3_ctco.common.policies import LOG_STD_MAX, LOG_STD_MIN, EnsembleLinear
-from sb3_ctco.common.soft_actor_critic import critic_loss, critic_target
+from sb3_ctco.common.soft_actor_critic import critic_loss
 from sb3_ctco.ctco.policies import OptionActor, OptionCritic
 
 if TYPE_CHECKING:
@@ -44,12 +44,14 @@ class HandGradients:
 
     @staticmethod
     def possible_for(model: CTCO) -> bool:
-        """Whether ``model`` has CTCO's own losses, networks of linear layers and rectifiers, and Adam, fused and stepped."""
+        """Whether ``model`` has networks of linear layers and rectifiers, and fused Adam that has stepped.
+
+        That its losses are CTCO's own is for the caller to know.
+        """
         actors, critics = (model.actor, model.actor_target), (model.critic, model.critic_target)
         optimizers = [model.actor.optimizer, model.critic.optimizer, *filter(None, [model.ent_coef_optimizer])]
         return (
-            _has_own_losses(model)
-            and model.entropy_reference != "duration"  # whose weight is another way to the gradient of d
+            model.entropy_reference != "duration"  # whose weight is another way to the gradient of d
             and all(type(actor) is OptionActor and _is_plain(actor.latent_pi, nn.Linear) for actor in actors)
             and all(type(critic) is OptionCritic and _is_plain(critic.q_networks, EnsembleLinear) for critic in critics)
             and all(type(network.features_extractor) is FlattenExtractor for network in actors + critics)
@@ -122,7 +124,7 @@ class PlainNetwork:
 
     def __init__(self, layers: Iterable[nn.Module]):
         modules = list(layers)
-        linear = [module for module in modules if not isinstance(module, nn.ReLU)]
+        linear: list[Any] = [module for module in modules if not isinstance(module, nn.ReLU)]
         #: Gradients, which :meth:`backward` writes, by their parameters.
         self.gradients: dict[nn.Parameter, th.Tensor] = {p: th.zeros_like(p) for layer in linear for p in layer.parameters()}
         # Views: an optimizer's steps show in them, and what is written to them in the gradients.
@@ -231,7 +233,7 @@ class _Adam:
     :param gradients: of its parameters
     """
 
-    def __init__(self, optimizer: th.optim.Optimizer, gradients: dict[nn.Parameter, th.Tensor]):
+    def __init__(self, optimizer: th.optim.Optimizer, gradients: dict[Any, th.Tensor]):
         self._groups: list[tuple[tuple[list[th.Tensor], ...], dict[str, Any]]] = []
         self._counters: list[tuple[th.Tensor, list[th.Tensor]]] = []
         for group in optimizer.param_groups:
@@ -239,7 +241,7 @@ class _Adam:
             # Parameters of a group have taken the same number of steps. One counter serves all until the end.
             count = states[0]["step"].clone()
             self._counters.append((count, [state["step"] for state in states]))
-            tensors = (
+            tensors: tuple[list[th.Tensor], ...] = (
                 [p.detach() for p in group["params"]],
                 [gradients[p] for p in group["params"]],
                 [state["exp_avg"] for state in states],
@@ -267,14 +269,6 @@ class _Adam:
         for count, steps in self._counters:
             for step in steps:
                 step.copy_(count)
-
-
-def _has_own_losses(model: CTCO) -> bool:
-    """Whether ``model`` is of a class that changes none of the losses whose gradients are written here."""
-    from sb3_ctco.ctco.ctco import CTCO
-
-    names = ("_sample_policy", "_critic_targets", "_q_values", "_actor_loss", "_update_temperatures", "entropy_costs")
-    return all(getattr(type(model), name) is getattr(CTCO, name) for name in names)
 
 
 def _as_ensemble(parameter: th.Tensor) -> th.Tensor:
