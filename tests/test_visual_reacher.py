@@ -222,7 +222,9 @@ def test_playing_a_sequence_is_stepping_in_a_loop():
         lengths = [1, 7, 50, 342]
         position = 0
         for n in lengths:
-            obs, rewards, terminated, truncated, info = one.step_sequence(actions[position : position + n])
+            observe = [k for k in (1, 4, 6, 40, 200) if k < n]
+            obs, rewards, terminated, truncated, info = one.step_sequence(actions[position : position + n], observe)
+            between = info.pop("observations", [])
             singles = [other.step(a) for a in actions[position : position + n]]
             position += n
             np.testing.assert_array_equal(obs["image"], singles[-1][0]["image"])
@@ -230,6 +232,9 @@ def test_playing_a_sequence_is_stepping_in_a_loop():
             assert list(rewards) == [s[1] for s in singles]
             assert (terminated, truncated) == singles[-1][2:4]
             assert info == singles[-1][4]
+            for k, seen in zip(observe, between, strict=True):
+                for key, value in singles[k - 1][0].items():
+                    np.testing.assert_array_equal(seen[key], value)
         assert truncated
         with pytest.raises(ResetNeeded, match="reset"):
             one.step_sequence(actions[:1])

@@ -1,6 +1,7 @@
 """A velocity-controlled arm looks for a red bag with the camera on its wrist."""
 
 import math
+from collections.abc import Sequence
 from typing import Any, Literal
 
 import gymnasium as gym
@@ -204,10 +205,13 @@ class VisualReacherEnv(gym.Env[dict[str, np.ndarray], np.ndarray]):
         obs, rewards, terminated, truncated, info = self.step_sequence(np.asarray(action)[None])
         return obs, float(rewards[0]), terminated, truncated, info
 
-    def step_sequence(self, actions: np.ndarray) -> tuple[dict[str, np.ndarray], np.ndarray, bool, bool, dict[str, Any]]:
+    def step_sequence(
+        self, actions: np.ndarray, observe: Sequence[int] = ()
+    ) -> tuple[dict[str, np.ndarray], np.ndarray, bool, bool, dict[str, Any]]:
         """Play several actions; see :class:`~sb3_ctco.wrappers.SupportsStepSequence`.
 
         :param actions: joint velocities in rad/s, shape ``[n_steps, 7]``; clipped to the action space
+        :param observe: numbers of steps after which to observe, too, increasing
         :return: last observation, the rewards of the steps that ran, terminated (never), truncated, info
         :raises gymnasium.error.ResetNeeded: before the first reset and after the end of an episode
         """
@@ -215,7 +219,11 @@ class VisualReacherEnv(gym.Env[dict[str, np.ndarray], np.ndarray]):
             raise gym.error.ResetNeeded("call reset() first: the environment was not reset, or its episode has ended")
         actions = np.clip(actions, -MAX_VELOCITY, MAX_VELOCITY)[: self._step_limit - self._steps_done]
         rewards = np.empty(len(actions))
+        observations = []
         for k, action in enumerate(actions):
+            if k in observe:
+                self._action[:] = actions[k - 1]
+                observations.append(self._observation())
             self._move(action)
             # The slack keeps a period that divides the camera's from missing a picture by rounding.
             picture = math.floor(self._steps_done * self.dt * IMAGE_RATE + 1e-6)
@@ -225,7 +233,10 @@ class VisualReacherEnv(gym.Env[dict[str, np.ndarray], np.ndarray]):
             rewards[k] = self._visibility >= REWARD_THRESHOLD
         self._action[:] = actions[-1]
         truncated = self._steps_done >= self._step_limit
-        return self._observation(), rewards, False, truncated, {"bag_visibility": self._visibility}
+        info: dict[str, Any] = {"bag_visibility": self._visibility}
+        if observe:
+            info["observations"] = observations
+        return self._observation(), rewards, False, truncated, info
 
     def render(self) -> np.ndarray | None:  # type: ignore[override]
         """The scene from outside, uint8 ``[height, width, 3]``, if ``render_mode`` is ``"rgb_array"``."""
