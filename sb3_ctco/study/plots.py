@@ -89,7 +89,7 @@ def interquartile_means(records: Sequence[Record], metric: str) -> dict[Line, di
             complete = [seed for seed in seeds if all((*line, rate, seed, task) in values for task in tasks)]
             if not complete:
                 continue
-            scores = np.array([[values[*line, rate, seed, task] for task in tasks] for seed in complete])
+            scores = np.array([[values[(*line, rate, seed, task)] for task in tasks] for seed in complete])
             scores = scores * DEFAULT_DISCOUNT_RATE
             low = high = math.nan
             if len(complete) > 1:
