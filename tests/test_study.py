@@ -12,14 +12,10 @@ import time
 from pathlib import Path
 
 import gymnasium as gym
+import matplotlib as mpl
 import numpy as np
 import pytest
 import yaml
-
-for module in ("dm_control", "joblib", "rliable"):
-    pytest.importorskip(module)
-
-import matplotlib as mpl
 from rliable.metrics import aggregate_iqm
 
 from sb3_ctco.study import agents, plots, runs, status
@@ -58,6 +54,11 @@ def tiny(folder: Path, name: str = "tiny", **changes) -> str:
     file = folder / f"{name}.yml"
     file.write_text(yaml.safe_dump({**content, **changes}))
     return str(file)
+
+
+@pytest.fixture
+def few_resamples(monkeypatch):
+    monkeypatch.setattr(plots, "_BOOTSTRAP_REPETITIONS", 50)
 
 
 def wait_for(condition, seconds: float = 60.0) -> None:
@@ -419,11 +420,13 @@ def test_the_figure_shows_the_records_and_the_paper():
         np.testing.assert_allclose(
             lines["CTCO (paper)"].get_ydata(), 0.5 * np.array(list(paper_returns()[task, "ctco"].values()))
         )
-        band = ax.collections[0].get_paths()[0].vertices[:, 1]
-        ctco = paper_returns()[task, "ctco"][50] * 0.5
-        assert np.isclose(band, ctco + 12.706 * 0.1, rtol=1e-3).any()
+        # The first line's interval at 50 Hz, by hand: t(0.975, 1) = 12.706 times 0.2/√2/√2.
+        (_, low), (_, high) = ax.collections[0].get_segments()[0]
+        mean = 0.5 * paper_returns()[task, "ctco"][50]
+        assert (low, high) == pytest.approx((mean - 1.2706, mean + 1.2706), rel=1e-3)
 
 
+@pytest.mark.usefixtures("few_resamples")
 def test_interquartile_means_are_those_of_rliable():
     estimates = plots.interquartile_means(synthetic(), "discounted_return")
     tau = -math.log(0.98) / 0.05
@@ -440,17 +443,20 @@ def test_interquartile_means_are_those_of_rliable():
     assert math.isnan(high)
 
 
+@pytest.mark.usefixtures("few_resamples")
 def test_the_table_stands_beside_the_papers_numbers():
-    lines = plots.table(synthetic()).splitlines()
+    estimates = {"discounted_return": plots.interquartile_means(synthetic(), "discounted_return")}
+    lines = plots.table(synthetic(), estimates).splitlines()
     training = lines[: lines.index("## Discounted return, greedy episodes")]
     assert "| cheetah run | SAC | large | 2 | 1.07 ± 1.27 | 0.15 ± 1.27 | 0.06 ± 1.27 | 0.07 ± 1.27 |" in training
     assert "| cheetah run | SAC | *the paper's figure* | 30 | 1.07 | 0.15 | 0.06 | 0.07 |" in training
     assert "| cheetah run | SAC | large | 2 | 1.27 ± 1.27 | 0.35 ± 1.27 | 0.26 ± 1.27 | 0.27 ± 1.27 |" in lines
     assert any(line.startswith("| training | CTCO | tuned | ") and "[" in line for line in lines)
-    assert "2,400" in lines[0] or "2400 s of task time" in lines[0]
-    assert "| cheetah run | SAC | large | 1 | 0.97 | 0.05 | -0.04 | -0.03 |" in plots.table(synthetic(1))
+    assert lines[0].startswith("Preset quick (2400 s of task time); 2 seeds; commit abc1234.")
+    assert "| cheetah run | SAC | large | 1 | 0.97 | 0.05 | -0.04 | -0.03 |" in plots.table(synthetic(1), {})
 
 
+@pytest.mark.usefixtures("few_resamples")
 def test_plot_of_a_csv_file_and_of_a_folder(finished, tmp_path, capsys):
     file = write_csv(tmp_path / "quick.csv", synthetic())
     assert main(["plot", str(file), "--output", str(tmp_path / "figures")]) == 0
