@@ -1,13 +1,13 @@
-"""The console script ``sb3-ctco``: RL Zoo's commands, and the study, which does without RL Zoo."""
+"""The console script ``sb3-ctco``."""
 
 import sys
 
+from sb3_ctco.study.cli import main as study
+
 
 def main() -> None:
-    """Run the command of the process's arguments."""
+    """Hand over to the study, which does without RL Zoo, or to RL Zoo's commands."""
     if sys.argv[1:2] == ["study"]:
-        from sb3_ctco.study.cli import main as study  # noqa: PLC0415
-
         sys.exit(study(sys.argv[2:]))
     from sb3_ctco.zoo import main as zoo  # noqa: PLC0415
 

@@ -34,6 +34,7 @@ from sb3_ctco.common.option_algorithm import OptionOffPolicyAlgorithm
 from sb3_ctco.ctco import CTCO
 from sb3_ctco.dac_ppo import DACPPO
 from sb3_ctco.figar_sac import FiGARSAC
+from sb3_ctco.study.cli import main as study
 
 #: The package's algorithms by their names in the Zoo.
 ALGORITHMS: dict[str, type[BaseAlgorithm]] = {"ctco": CTCO, "dac_ppo": DACPPO, "figar_sac": FiGARSAC}
@@ -170,6 +171,7 @@ COMMANDS = {
     "train": "train an agent",
     "enjoy": "watch an agent that was trained",
     "tune": "search hyperparameters with Optuna (train --optimize-hyperparameters)",
+    "study": "the frequency study; its flags are its own, see sb3-ctco study --help",
 }
 
 
@@ -180,13 +182,15 @@ def main(arguments: Sequence[str] | None = None) -> None:
     """
     parser = argparse.ArgumentParser(
         prog="sb3-ctco",
-        description="RL Zoo with CTCO. Every command takes RL Zoo's flags; sb3-ctco COMMAND --help lists them.",
+        description="RL Zoo with CTCO. Commands take RL Zoo's flags; sb3-ctco COMMAND --help lists them.",
         epilog="\n".join(f"{name:7} {text}" for name, text in COMMANDS.items()),
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     parser.add_argument("command", choices=COMMANDS)
     parser.add_argument("flags", nargs=argparse.REMAINDER, help="RL Zoo's flags; --algo is ctco by default")
     args = parser.parse_args(arguments)
+    if args.command == "study":
+        sys.exit(study(args.flags))
 
     argv, manager = sys.argv, rl_zoo3.train.ExperimentManager
     sys.argv = [f"sb3-ctco {args.command}", *with_defaults(args.command, args.flags)]

@@ -15,7 +15,7 @@ from sb3_ctco.ctco import CTCO
 from sb3_ctco.dac_ppo import DACPPO
 from sb3_ctco.figar_sac import FiGARSAC
 from sb3_ctco.options import discount_rate_from_gamma
-from sb3_ctco.study.grid import Run
+from sb3_ctco.study.grid import EPISODE_SECONDS, Run
 from sb3_ctco.wrappers import RewardRateWrapper
 
 #: What may be an argument in a preset file, beside those in seconds
@@ -31,7 +31,7 @@ def constructor_arguments(run: Run) -> dict[str, Any]:
     if run.algorithm in ("ctco", "figar_sac") and "learning_starts_seconds" in arguments:
         arguments["learning_starts"] = round(arguments.pop("learning_starts_seconds") * run.rate)
     if run.algorithm == "dac_ppo" and "rollout_seconds" in arguments:
-        arguments["n_steps"] = round(arguments.pop("rollout_seconds") * run.rate)
+        arguments["n_steps"] = round(arguments.pop("rollout_seconds") * run.rate / n_envs(run))
     known = {name for callable_ in _SIGNATURES[run.algorithm] for name in inspect.signature(callable_).parameters}
     unknown = sorted(set(arguments) - known)
     if unknown:
@@ -45,18 +45,27 @@ def constructor_arguments(run: Run) -> dict[str, Any]:
     return arguments
 
 
+def n_envs(run: Run) -> int:
+    """Number of environments: one, but for DAC-PPO as many as a rollout has episodes.
+
+    Its policy does not change within a rollout, so episodes side by side are what they are one after the other, and cost
+    less. Task time is summed over them.
+    """
+    return max(1, round(run.arguments.get("rollout_seconds", 0.0) / EPISODE_SECONDS))
+
+
 def discount_rate(run: Run) -> float:
     """τ, in 1/s."""
     return discount_rate_from_gamma(run.arguments["gamma"], run.arguments["gamma_dt"])
 
 
 def make_model(run: Run) -> BaseAlgorithm:
-    """The model of a run with its environment; for DAC-PPO observations are normalised."""
+    """The model of a run with its environment, or environments; for DAC-PPO observations are normalised."""
     arguments = {**constructor_arguments(run), "seed": run.seed, "device": "cpu"}
     if run.algorithm == "sac":
         return sac_at_rate(_make_env(run), dt=run.dt, **arguments)
     if run.algorithm == "dac_ppo":
-        return DACPPO("MlpPolicy", _normalised(_with_reward_rate(run)), **arguments)
+        return DACPPO("MlpPolicy", _normalised(_with_reward_rate(run, n_envs(run))), **arguments)
     algorithm = CTCO if run.algorithm == "ctco" else FiGARSAC
     return algorithm("MlpPolicy", _make_env(run), **arguments)
 
@@ -80,8 +89,11 @@ def _make_env(run: Run) -> gym.Env:
     return gym.make(run.env_id, disable_env_checker=True)
 
 
-def _with_reward_rate(run: Run) -> VecEnv:
-    return DummyVecEnv([lambda: RewardRateWrapper(Monitor(_make_env(run)), dt=run.dt, discount_rate=discount_rate(run))])
+def _with_reward_rate(run: Run, n_envs: int = 1) -> VecEnv:
+    def make() -> gym.Env:
+        return RewardRateWrapper(Monitor(_make_env(run)), dt=run.dt, discount_rate=discount_rate(run))
+
+    return DummyVecEnv([make] * n_envs)
 
 
 def _normalised(env: VecEnv) -> VecNormalize:

@@ -34,6 +34,8 @@ _CURVE_EPISODES = 12
 
 #: An algorithm and its setting, which is a line of a figure
 Line = tuple[str, str]
+#: Interquartile mean with lower and upper bound, by line, then by rate in Hz
+Estimates = dict[Line, dict[int, tuple[float, float, float]]]
 
 
 def mean_and_interval(values: Sequence[float]) -> tuple[float, float]:
@@ -65,13 +67,11 @@ def tasks_of(records: Sequence[Record]) -> list[str]:
     return [task for task in TASKS if any(record["task"] == task for record in records)]
 
 
-def interquartile_means(records: Sequence[Record], metric: str) -> dict[Line, dict[int, tuple[float, float, float]]]:
-    """Interquartile mean over seeds and tasks with its 95 % interval, by rate in Hz, from rliable.
+def interquartile_means(records: Sequence[Record], metric: str) -> Estimates:
+    """Interquartile means over seeds and tasks with their 95 % intervals, from rliable.
 
     Scores are returns times τ, that is fractions of the most that a reward of 1 a second can give. A rate needs at least
     one seed that is complete in all tasks; its interval is that of a bootstrap over seeds within tasks, and nan for one.
-
-    :return: interquartile mean, lower and upper bound
     """
     from rliable.library import get_interval_estimates  # noqa: PLC0415
     from rliable.metrics import aggregate_iqm  # noqa: PLC0415
@@ -83,13 +83,13 @@ def interquartile_means(records: Sequence[Record], metric: str) -> dict[Line, di
     }
     rates = sorted({_rate(record) for record in records})
     seeds = sorted({record["seed"] for record in records})
-    estimates: dict[Line, dict[int, tuple[float, float, float]]] = {}
+    estimates: Estimates = {}
     for line in lines_of(records):
         for rate in rates:
             complete = [seed for seed in seeds if all((*line, rate, seed, task) in values for task in tasks)]
             if not complete:
                 continue
-            scores = np.array([[values[*line, rate, seed, task] for task in tasks] for seed in complete])
+            scores = np.array([[values[(*line, rate, seed, task)] for task in tasks] for seed in complete])
             scores = scores * DEFAULT_DISCOUNT_RATE
             low = high = math.nan
             if len(complete) > 1:
@@ -111,14 +111,16 @@ def draw_metric(records: Sequence[Record], metric: str) -> "Figure":
     paper = paper_returns() if metric != "decision_rate_hz" else {}
     lines = lines_of(records)
     for ax, task in zip(axes[0], tasks, strict=True):
+        shown: list[float] = []
         for line, rates in by_line(records, task, metric).items():
-            style, label = _style(line, lines)
             means, half_widths = np.array([mean_and_interval(values) for values in rates.values()]).T
-            _line_with_band(ax, list(rates), means, means - half_widths, means + half_widths, style, label)
-            for rate, values in rates.items():
-                ax.plot([rate] * len(values), values, ".", color=style["color"], markersize=3)
+            _line_with_intervals(ax, list(rates), means, means - half_widths, means + half_widths, line, lines)
+            for x, values in zip(_apart(list(rates), line, lines), rates.values(), strict=True):
+                ax.plot([x] * len(values), values, ".", color=_COLOURS[line[0]], markersize=3)
+                shown += values
         for algorithm in ALGORITHMS:
             if numbers := paper.get((task, algorithm)):
+                shown += numbers.values()
                 label = f"{ALGORITHM_NAMES[algorithm]}, the paper's figure"
                 colour = _COLOURS[algorithm]
                 ax.plot(list(numbers), list(numbers.values()), "--", color=colour, linewidth=0.8, alpha=0.7, label=label)
@@ -127,25 +129,28 @@ def draw_metric(records: Sequence[Record], metric: str) -> "Figure":
         if metric == "decision_rate_hz":
             ax.set_yscale("log")
         else:
-            ax.set_ylim(bottom=min(0.0, ax.dataLim.y0))
+            _return_axis(ax, shown)
     axes[0][0].set_ylabel(METRICS[metric])
-    _legend(figure, axes[0][0], f"mean and 95 % interval of {_seeds(records)}; a dot a seed")
+    _legend(figure, axes[0][0], f"mean and 95 % interval (Student's t) of {_seeds(records)}; a dot a seed")
     return figure
 
 
-def draw_interquartile_means(records: Sequence[Record]) -> "Figure":
-    """Interquartile means over the interaction rate: training episodes and greedy ones."""
+def draw_interquartile_means(records: Sequence[Record], estimates: dict[str, Estimates]) -> "Figure":
+    """Interquartile means over the interaction rate: training episodes and greedy ones.
+
+    :param records: which they are of
+    :param estimates: by metric
+    """
     figure, axes = _panels(1, 2)
     lines = lines_of(records)
-    for ax, metric in zip(axes[0], ("discounted_return", "greedy_return"), strict=True):
-        for line, rates in interquartile_means(records, metric).items():
-            style, label = _style(line, lines)
+    for ax, (metric, of_lines) in zip(axes[0], estimates.items(), strict=True):
+        for line, rates in of_lines.items():
             means, low, high = np.array(list(rates.values())).T
-            _line_with_band(ax, list(rates), means, low, high, style, label)
+            _line_with_intervals(ax, list(rates), means, low, high, line, lines)
         _rate_axis(ax, records)
         ax.set_title(METRICS[metric].split(",\n")[1])
         ax.set_ylim(bottom=0.0)
-    axes[0][0].set_ylabel("interquartile mean over tasks and seeds\nof discounted return × τ")
+    axes[0][0].set_ylabel("interquartile mean\nof discounted return × τ")
     _legend(figure, axes[0][0], f"95 % intervals: stratified bootstrap over {_seeds(records)}")
     return figure
 
@@ -176,12 +181,20 @@ def draw_learning_curves(folder: Path) -> "Figure":
         row[0].set_ylabel("discounted return")
     for ax in axes[-1]:
         ax.set_xlabel("task time [min]")
-    _legend(figure, axes[0][0], f"a line a seed; mean of {_CURVE_EPISODES} training episodes")
+    _legend(
+        figure,
+        axes[0][0],
+        f"a line a seed; mean of (up to) {_CURVE_EPISODES} training episodes",
+    )
     return figure
 
 
-def table(records: Sequence[Record]) -> str:
-    """Markdown: returns and decision rates of each task, algorithm and rate, beside the paper's returns."""
+def table(records: Sequence[Record], estimates: dict[str, Estimates]) -> str:
+    """Markdown: returns and decision rates of each task, algorithm and rate, beside the paper's returns.
+
+    :param records: of the runs
+    :param estimates: interquartile means by metric
+    """
     rates = sorted({_rate(record) for record in records})
     presets = sorted({f"{record['preset']} ({record['task_seconds']:g} s of task time)" for record in records})
     commits = sorted({record["commit"] for record in records})
@@ -212,9 +225,10 @@ def table(records: Sequence[Record]) -> str:
     )
     parts.append(_row("episodes", "algorithm", "setting", *(f"{rate} Hz" for rate in rates)))
     parts.append(_row(*["---"] * (3 + len(rates))))
-    for metric, name in (("discounted_return", "training"), ("greedy_return", "greedy")):
-        for (algorithm, setting), estimates in interquartile_means(records, metric).items():
-            cells = (_interval_cell(estimates.get(rate)) for rate in rates)
+    for metric, of_lines in estimates.items():
+        name = {"discounted_return": "training", "greedy_return": "greedy"}[metric]
+        for (algorithm, setting), of_rates in of_lines.items():
+            cells = (_interval_cell(of_rates.get(rate)) for rate in rates)
             parts.append(_row(name, ALGORITHM_NAMES[algorithm], setting, *cells))
     return "\n".join(parts) + "\n"
 
@@ -235,11 +249,12 @@ def plot(source: Path, output: Path) -> list[Path]:
     mpl.rcParams.update({"svg.fonttype": "none", "svg.hashsalt": "sb3-ctco"})
     records = read_records(source)
     output.mkdir(parents=True, exist_ok=True)
+    estimates = {metric: interquartile_means(records, metric) for metric in ("discounted_return", "greedy_return")}
     figures = {
         "frequency": draw_metric(records, "discounted_return"),
         "frequency_greedy": draw_metric(records, "greedy_return"),
         "decision_rates": draw_metric(records, "decision_rate_hz"),
-        "interquartile_means": draw_interquartile_means(records),
+        "interquartile_means": draw_interquartile_means(records, estimates),
     }
     if source.is_dir():
         figures["learning_curves"] = draw_learning_curves(source)
@@ -250,7 +265,7 @@ def plot(source: Path, output: Path) -> list[Path]:
             figure.savefig(written[-1], dpi=120, metadata=metadata)
         plt.close(figure)
     written.append(output / "table.md")
-    written[-1].write_text(table(records), encoding="utf-8")
+    written[-1].write_text(table(records, estimates), encoding="utf-8")
     return written
 
 
@@ -289,17 +304,30 @@ def _style(line: Line, lines: Sequence[Line]) -> tuple[dict[str, Any], str]:
     return style, f"{ALGORITHM_NAMES[algorithm]} ({setting})"
 
 
-def _line_with_band(
-    ax: "Axes",
-    rates: list[int],
-    means: np.ndarray,
-    low: np.ndarray,
-    high: np.ndarray,
-    style: dict[str, Any],
-    label: str,
+def _line_with_intervals(
+    ax: "Axes", rates: Sequence[int], means: np.ndarray, low: np.ndarray, high: np.ndarray, line: Line, lines: Sequence[Line]
 ) -> None:
+    """Draw a line over the rates with its intervals as bars, set a little apart from those of other lines."""
+    style, label = _style(line, lines)
     ax.plot(rates, means, marker="o", markersize=4, label=label, **style)
-    ax.fill_between(rates, low, high, color=style["color"], alpha=0.15, linewidth=0)
+    ax.errorbar(
+        _apart(rates, line, lines),
+        means,
+        (means - low, high - means),
+        fmt="none",
+        color=style["color"],
+        elinewidth=0.8,
+        capsize=2,
+    )
+
+
+def _apart(rates: Sequence[int], line: Line, lines: Sequence[Line]) -> np.ndarray:
+    return np.array(rates) * 1.03 ** (lines.index(line) - (len(lines) - 1) / 2)
+
+
+def _return_axis(ax: "Axes", shown: Sequence[float]) -> None:
+    """From zero to a little above what is shown; wide intervals of few seeds run off the panel."""
+    ax.set_ylim(min(0.0, *shown), 1.08 * max(*shown, 0.1))
 
 
 def _rate_axis(ax: "Axes", records: Sequence[Record]) -> None:

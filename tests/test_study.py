@@ -1,0 +1,517 @@
+"""The frequency study: its grid, its runs in folders, the engines, records and figures."""
+
+import csv
+import json
+import math
+import os
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import gymnasium as gym
+import matplotlib as mpl
+import numpy as np
+import pytest
+import yaml
+from rliable.metrics import aggregate_iqm
+
+from sb3_ctco.study import agents, plots, runs, status
+from sb3_ctco.study.cli import main
+from sb3_ctco.study.grid import Run, load_preset, preset_names
+from sb3_ctco.study.records import COLUMNS, collect, paper_returns, read_records
+
+mpl.use("Agg")
+
+#: A process of its own for the command, to be killed
+COMMAND = [sys.executable, "-c", "from sb3_ctco.cli import main; main()", "study"]
+ALGORITHMS = ("ctco", "sac", "figar_sac", "dac_ppo")
+
+
+@pytest.fixture(scope="module", autouse=True)
+def one_thread_each():
+    """For worker processes, which have their settings from the environment."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("OMP_NUM_THREADS", "1")
+        yield
+
+
+def tiny(folder: Path, name: str = "tiny", **changes) -> str:
+    """A preset file of runs that take a second or two: by default CTCO with two seeds on one task at 50 Hz."""
+    ctco = {"gamma": 0.98, "gamma_dt": 0.05, "updates_per_second": 0.1, "learning_starts_seconds": 20, "batch_size": 8}
+    content = {
+        "task_seconds": 100,
+        "eval_episodes": 1,
+        "tasks": ["point_mass"],
+        "rates": [50],
+        "seeds": 2,
+        "algorithms": {
+            "ctco": {"setting": "small", "arguments": {**ctco, "policy_kwargs": {"net_arch": {"pi": [4], "qf": [4]}}}},
+        },
+    }
+    file = folder / f"{name}.yml"
+    file.write_text(yaml.safe_dump({**content, **changes}))
+    return str(file)
+
+
+@pytest.fixture
+def few_resamples(monkeypatch):
+    monkeypatch.setattr(plots, "_BOOTSTRAP_REPETITIONS", 50)
+
+
+def wait_for(condition, seconds: float = 60.0) -> None:
+    end = time.monotonic() + seconds
+    while not condition():
+        assert time.monotonic() < end, "it did not happen"
+        time.sleep(0.02)
+
+
+# --- presets
+
+
+def test_the_presets_are_the_grids_that_they_should_be():
+    assert preset_names() == ["paper", "quick", "smoke"]
+    paper, quick = load_preset("paper"), load_preset("quick")
+    assert len(paper.select(settings=["paper"])) == 30 * 4 * 3 * 4
+    assert {run.task_seconds for run in paper.runs} == {400 * 60}
+    assert len(quick.runs) == 2 * 5 * 3 * 4
+    for preset in (paper, quick):
+        assert {run.rate for run in preset.runs} == {50, 100, 250, 500}
+        assert {run.task for run in preset.runs} == {"point_mass", "cheetah", "ball_in_cup"}
+        assert {run.algorithm for run in preset.runs} == set(ALGORITHMS)
+        assert len({run.name for run in preset.runs}) == len(preset.runs)
+        assert {(run.arguments["gamma"], run.arguments["gamma_dt"]) for run in preset.runs} == {(0.98, 0.05)}
+        assert {run.arguments["updates_per_second"] for run in preset.runs} == {20}
+    for run in paper.select(settings=["paper"]):
+        critics = "vf" if run.algorithm == "dac_ppo" else "qf"
+        assert run.arguments["policy_kwargs"] == {"net_arch": {"pi": [10, 10], critics: [64, 64]}}
+    ctco = paper.select(algorithms=["ctco"], settings=["paper"])[0].arguments
+    assert (ctco["high_freq_penalty"], ctco["n_rbf"]) == (0.05, 3)
+    # A seed is complete before the next one begins, and in it the runs that take longest are first.
+    assert [run.seed for run in quick.runs] == [0] * 60 + [1] * 60
+    assert [run.rate for run in quick.runs[:60]] == sorted((run.rate for run in quick.runs[:60]), reverse=True)
+
+
+@pytest.mark.parametrize("name", ["smoke", "quick", "paper"])
+def test_every_setting_fits_its_constructor_and_environment(name):
+    for run in load_preset(name).runs:
+        agents.constructor_arguments(run)
+        assert gym.spec(run.env_id).kwargs["dt"] == pytest.approx(run.dt)
+        assert gym.spec(run.env_id).kwargs["time_limit"] == 10.0
+
+
+@pytest.mark.parametrize("rate", [50, 500])
+@pytest.mark.parametrize("algorithm", ALGORITHMS)
+def test_seconds_become_steps(algorithm, rate):
+    (run, *_) = load_preset("quick").select(tasks=["point_mass"], rates=[rate], algorithms=[algorithm])
+    arguments = {**run.arguments, "buffer_size": 1000} if algorithm != "dac_ppo" else run.arguments
+    model = agents.make_model(Run(**{**run.as_dict(), "arguments": arguments}))
+    if algorithm in ("sac", "dac_ppo"):
+        gamma = model.gamma if algorithm == "sac" else model.step_gamma
+        assert gamma == pytest.approx(0.98 ** (1 / rate / 0.05))
+        assert model.get_env().get_attr("option_settings")[0].dt == pytest.approx(1 / rate)
+    if algorithm == "sac":
+        assert model.gradient_steps / model.train_freq.frequency * rate == pytest.approx(20)
+    else:
+        assert model.updates_per_second == 20
+    if algorithm == "dac_ppo":
+        # 40 s are four episodes of 10 s, one in each of four environments.
+        assert (model.n_steps, model.n_envs) == (10 * rate, 4)
+    else:
+        assert model.learning_starts == 60 * rate
+    assert model.seed == 0
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"tasks": ["walker"]}, r"tasks must be a list of some of .*'ball_in_cup'.* not \['walker'\]"),
+        ({"rates": [60]}, r"rates must be a list of some of \(50, 100, 250, 500\), each once, not \[60\]"),
+        ({"seeds": 0}, "seeds must be a whole number from 1, not 0"),
+        ({"task_seconds": 50}, "task_seconds must be at least 100, so that an episode of 10 s ends in the last tenth"),
+        ({"step": 1}, r"\[\] missing, \['step'\] unknown"),
+        ({"algorithms": {"ppo": {"setting": "a", "arguments": {}}}}, "must be one of .* not 'ppo'"),
+    ],
+)
+def test_mistakes_in_a_preset(tmp_path, changes, message):
+    with pytest.raises(ValueError, match=message):
+        load_preset(tiny(tmp_path, **changes))
+
+
+def test_mistakes_on_the_command_line(tmp_path, capsys):
+    preset = tiny(tmp_path, algorithms={"ctco": {"setting": "a", "arguments": {"gama": 0.9}}})
+    for arguments, message in [
+        (["run", "--preset", "none"], "no preset 'none': name one of ['paper', 'quick', 'smoke'], or a YAML file"),
+        (["run", "--preset", "quick", "--rates", "60"], "preset quick has no rate [60]; it has [50, 100, 250, 500]"),
+        (["run", "--preset", preset], "ctco (a) has no arguments ['gama']"),
+        (["run", "--preset", preset, "--workers", "0"], "--workers must be at least 1, not 0"),
+        (["run", "--preset", preset, "--address", "auto"], "--address auto is Ray's: add --engine ray"),
+        (["status", str(tmp_path)], "is no folder of a study"),
+        (["plot", str(tmp_path)], "no run in"),
+    ]:
+        assert main(arguments) == 1
+        assert message in capsys.readouterr().err
+
+
+def test_the_study_needs_no_rl_zoo():
+    code = "import sys; sys.modules['rl_zoo3'] = None; from sb3_ctco.cli import main; main()"
+    output = subprocess.run([sys.executable, "-c", code, "study", "--help"], capture_output=True, text=True, check=True)
+    assert "status" in output.stdout
+
+
+# --- runs
+
+
+@pytest.fixture(scope="module")
+def finished(tmp_path_factory) -> tuple[str, Path]:
+    """A preset file, and the folder of its study: two seeds, complete."""
+    folder = tmp_path_factory.mktemp("finished")
+    preset = tiny(folder)
+    assert main(["run", "--preset", preset, "--folder", str(folder / "study"), "--workers", "1"]) == 0
+    return preset, folder / "study"
+
+
+def test_a_run_leaves_its_settings_versions_episodes_and_record(finished):
+    preset, folder = finished
+    run = load_preset(preset).runs[0]
+    path = folder / run.name
+    assert run.name == "point_mass-ctco_small-50hz-seed0"
+    assert Run(**json.loads((path / "settings.json").read_text())) == run
+    assert {"python", "torch", "commit", "mujoco"} <= set(json.loads((path / "versions.json").read_text()))
+    episodes = list(csv.DictReader((path / "monitor.csv").open()))
+    assert [float(episode["task_seconds"]) for episode in episodes] == pytest.approx(range(10, 101, 10))
+    record = json.loads((path / "record.json").read_text())
+    assert list(record) == list(COLUMNS)
+    # Of ten episodes, the last one ends in the last tenth.
+    assert record["discounted_return"] == float(episodes[-1]["discounted_return"])
+    (greedy,) = csv.DictReader((path / "evaluation.csv").open())
+    assert record["greedy_return"] == float(greedy["discounted_return"])
+    assert (record["task"], record["algorithm"], record["dt"], record["seed"]) == ("point_mass", "ctco", 0.02, 0)
+    assert (record["task_seconds"], record["updates"], record["preset"]) == (100.0, 8, "tiny")
+    assert 1.0 <= record["decision_rate_hz"] <= 50.0
+
+
+def test_finished_runs_are_skipped_and_broken_ones_begin_again(finished, tmp_path, capsys):
+    preset, original = finished
+    folder = tmp_path / "study"
+    shutil.copytree(original, folder)
+    whole, broken = sorted(folder.iterdir())
+    before = {path: path.stat().st_mtime_ns for path in whole.rglob("*")}
+    record = json.loads((broken / "record.json").read_text())
+    (broken / "record.json").unlink()
+    (broken / "monitor.csv").write_text("task_seconds,discounted_return\n1.0,")
+    assert main(["run", "--preset", preset, "--folder", str(folder), "--workers", "1"]) == 0
+    assert "1 of 2 runs are complete" in capsys.readouterr().out
+    assert {path: path.stat().st_mtime_ns for path in whole.rglob("*") if path in before} == before
+    again = json.loads((broken / "record.json").read_text())
+    assert again["discounted_return"] == record["discounted_return"]  # The seed makes it reproducible.
+
+
+def test_a_folder_with_other_settings_is_refused(finished, tmp_path, capsys):
+    _, folder = finished
+    other = tiny(tmp_path, eval_episodes=2)
+    assert main(["run", "--preset", other, "--folder", str(folder)]) == 1
+    assert "eval_episodes: 1 there, 2 in the preset. Name another --folder, or delete" in capsys.readouterr().err
+
+
+def test_a_failed_run_is_recorded_and_stops_no_other(tmp_path, capsys):
+    bad = {"setting": "bad", "arguments": {"gamma": 0.98, "gamma_dt": 0.05, "updates_per_second": 20, "d_max": -1.0}}
+    good = yaml.safe_load(Path(tiny(tmp_path)).read_text())["algorithms"]["ctco"]
+    preset = tiny(tmp_path, algorithms={"bad": {"algorithm": "ctco", **bad}, "ctco": good}, seeds=1)
+    folder = tmp_path / "study"
+    assert main(["run", "--preset", preset, "--folder", str(folder), "--workers", "2"]) == 1
+    output = capsys.readouterr().out
+    assert "1 of 2 runs done, 0 running, 1 failed" in output
+    error = (folder / "point_mass-ctco_bad-50hz-seed0" / "error.txt").read_text()
+    assert error.startswith("Traceback")
+    assert "ValueError: d_max" in error
+    assert (folder / "point_mass-ctco_small-50hz-seed0" / "record.json").exists()
+    assert main(["status", str(folder)]) == 0
+    assert "failed  point_mass-ctco_bad-50hz-seed0: ValueError: d_max" in capsys.readouterr().out
+
+
+def test_two_studies_on_one_folder(finished, tmp_path, capsys):
+    """What one is at, the other leaves alone, and says so."""
+    preset, original = finished
+    folder = tmp_path / "study"
+    shutil.copytree(original, folder)
+    first, second = sorted(folder.iterdir())
+    for path in (first, second):
+        (path / "record.json").unlink()
+    before = (first / "monitor.csv").stat().st_mtime_ns
+    with runs.lock(first) as locked:
+        assert locked
+        assert status.read_status(folder).of("running")[0].name == first.name
+        assert main(["run", "--preset", preset, "--folder", str(folder), "--workers", "1"]) == 3
+    assert f"{first.name} is in the hands of another study" in capsys.readouterr().out
+    assert (first / "monitor.csv").stat().st_mtime_ns == before
+    assert (second / "record.json").exists()
+    assert not runs.is_running(first)
+
+
+def test_two_studies_at_once_make_each_run_once(tmp_path):
+    preset, folder = tiny(tmp_path, seeds=3), tmp_path / "study"
+    arguments = [*COMMAND, "run", "--preset", preset, "--folder", str(folder), "--workers", "1"]
+    studies = [subprocess.Popen(arguments, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True) for _ in range(2)]
+    outputs = [study.communicate(timeout=120)[0] for study in studies]
+    assert {study.returncode for study in studies} <= {0, 3}, outputs
+    assert len(list(folder.glob("*/record.json"))) == 3
+    for file in folder.glob("*/monitor.csv"):
+        seconds = [float(row["task_seconds"]) for row in csv.DictReader(file.open())]
+        assert seconds == sorted(seconds)
+        assert len(seconds) == 10
+
+
+def test_kill_9_loses_only_the_runs_in_flight(tmp_path):
+    preset, folder = tiny(tmp_path, seeds=6), tmp_path / "study"
+    arguments = ["run", "--preset", preset, "--folder", str(folder), "--workers", "2"]
+    study = subprocess.Popen([*COMMAND, *arguments], stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+    wait_for(lambda: len(list(folder.glob("*/record.json"))) >= 2)
+    study.send_signal(signal.SIGKILL)
+    study.wait()
+    # Its workers see at the end of an episode that nobody waits for them.
+    wait_for(lambda: not any(runs.is_running(path) for path in folder.iterdir()), 30)
+    done = {file: file.stat().st_mtime_ns for file in folder.glob("*/record.json")}
+    assert 2 <= len(done) < 6
+    assert main(arguments) == 0
+    assert len(list(folder.glob("*/record.json"))) == 6
+    assert {file: file.stat().st_mtime_ns for file in done} == done
+
+
+def test_a_worker_that_dies_is_replaced(tmp_path):
+    preset, folder = tiny(tmp_path, seeds=4), tmp_path / "study"
+    arguments = ["run", "--preset", preset, "--folder", str(folder), "--workers", "2"]
+    study = subprocess.Popen([*COMMAND, *arguments], stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+    os.kill(worker_at_work(study.pid, folder), signal.SIGKILL)
+    assert study.wait(timeout=120) == 0
+    assert len(list(folder.glob("*/record.json"))) == 4
+
+
+@pytest.mark.slow
+def test_ray_ends_a_study_although_a_worker_is_killed(tmp_path):
+    pytest.importorskip("ray")
+    preset, folder = tiny(tmp_path, seeds=3), tmp_path / "study"
+    arguments = ["run", "--preset", preset, "--folder", str(folder), "--workers", "2", "--engine", "ray"]
+    study = subprocess.Popen([*COMMAND, *arguments], stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+    os.kill(worker_at_work(study.pid, folder), signal.SIGKILL)
+    assert study.wait(timeout=120) == 0
+    assert len(list(folder.glob("*/record.json"))) == 3
+
+
+def worker_at_work(study_pid: int, folder: Path) -> int:
+    """Wait for a run to have had an episode; the process that holds its lock."""
+    found: list[int] = []
+
+    def look() -> bool:
+        for file in folder.glob("*/monitor.csv"):
+            locked = str(file.parent / runs.LOCK)
+            if len(file.read_text().splitlines()) > 1 and not (file.parent / runs.RECORD).exists():
+                found.extend(pid for pid in processes() if locked in open_files(pid))
+        return bool(found)
+
+    wait_for(look)
+    assert study_pid not in found
+    return found[0]
+
+
+def processes() -> list[int]:
+    return [int(path.name) for path in Path("/proc").iterdir() if path.name.isdigit()]
+
+
+def open_files(pid: int) -> set[str]:
+    try:
+        return {os.readlink(file) for file in Path(f"/proc/{pid}/fd").iterdir()}
+    except OSError:
+        return set()
+
+
+# --- records and figures
+
+
+def synthetic(n_seeds: int = 2) -> list[dict]:
+    """Records whose returns are the paper's, ±0.1 with the seeds 0 and 1; CTCO with two settings."""
+    records = []
+    for run in load_preset("quick").runs:
+        if run.seed >= n_seeds:
+            continue
+        value = paper_returns()[run.task, run.algorithm][run.rate] * (0.5 if run.setting == "paper" else 1.0)
+        value += 0.1 * (2 * run.seed - 1)
+        rate = 3.0 if run.algorithm == "ctco" else float(run.rate)
+        made = {"discounted_return": value, "greedy_return": value + 0.2, "decision_rate_hz": rate}
+        made |= {
+            "greedy_decision_rate_hz": rate,
+            "updates": 48000,
+            "wall_seconds": 100.0,
+            "commit": "abc1234",
+            "versions": "a=1",
+        }
+        known = {name: getattr(run, name) for name in COLUMNS if name not in made}
+        records.append({name: {**known, **made}[name] for name in COLUMNS})
+    return records
+
+
+def write_csv(file: Path, records: list[dict]) -> Path:
+    with file.open("w", newline="") as stream:
+        writer = csv.DictWriter(stream, list(COLUMNS))
+        writer.writeheader()
+        writer.writerows(records)
+    return file
+
+
+def test_collect_merges_and_skip_records_skips(finished, tmp_path, capsys):
+    preset, folder = finished
+    into = tmp_path / "results" / "tiny.csv"
+    part = tmp_path / "part"
+    shutil.copytree(folder, part)
+    for path in part.glob("*seed1"):
+        (path / "record.json").unlink()
+    assert collect([part], into) == (1, 1)
+    elsewhere = str(tmp_path / "elsewhere")
+    assert main(["run", "--preset", preset, "--folder", elsewhere, "--skip-records", str(into), "--workers", "1"]) == 0
+    assert [path.name[-5:] for path in Path(elsewhere).iterdir()] == ["seed1"]
+    assert main(["collect", elsewhere, str(part), "--into", str(into)]) == 0
+    assert "1 new rows, 2 in" in capsys.readouterr().out
+    before = into.read_text()
+    assert collect([folder], into) == (0, 2)
+    assert into.read_text() == before
+    assert [record["seed"] for record in read_records(into)] == [0, 1]
+    assert read_records(into)[0] == read_records(folder)[0]
+    with into.open() as file:
+        columns = (
+            "task,algorithm,dt,seed,discounted_return,greedy_return,decision_rate_hz,task_seconds,updates,wall_seconds,preset"
+        )
+        assert file.readline().startswith(columns)
+    other = tiny(tmp_path, eval_episodes=2)
+    assert main(["run", "--preset", other, "--folder", str(tmp_path / "other"), "--skip-records", str(into)]) == 1
+    assert "with other settings" in capsys.readouterr().err
+
+
+def test_the_numbers_of_the_paper():
+    returns = paper_returns()
+    assert len(returns) == 12
+    assert returns["point_mass", "ctco"] == {50: 1.04, 100: 1.05, 250: 1.01, 500: 0.98}
+    assert returns["ball_in_cup", "figar_sac"] == {50: 1.90, 100: 1.92, 250: 1.85, 500: 0.71}
+    assert returns["cheetah", "dac_ppo"][500] == 0.24
+
+
+def test_mean_and_interval_by_hand():
+    # t(0.975, 1) = 12.706, the standard deviation of 1 and 1.2 is 0.2/√2, by √2 seeds.
+    assert plots.mean_and_interval([1.0, 1.2]) == pytest.approx((1.1, 12.706 * 0.1), rel=1e-4)
+    mean, half_width = plots.mean_and_interval([0.5])
+    assert mean == 0.5
+    assert math.isnan(half_width)
+
+
+def test_the_figure_shows_the_records_and_the_paper():
+    figure = plots.draw_metric(synthetic(), "discounted_return")
+    assert [ax.get_title() for ax in figure.axes] == ["sparse point mass", "cheetah run", "ball in cup"]
+    for ax, task in zip(figure.axes, ("point_mass", "cheetah", "ball_in_cup"), strict=True):
+        lines = {line.get_label(): line for line in ax.get_lines()}
+        assert ax.get_xscale() == "log"
+        for algorithm, name in plots.ALGORITHM_NAMES.items():
+            numbers = paper_returns()[task, algorithm]
+            setting = "tuned" if algorithm == "ctco" else "large"
+            for label in (f"{name} ({setting})", f"{name}, the paper's figure"):
+                assert list(lines[label].get_xdata()) == [50, 100, 250, 500]
+                np.testing.assert_allclose(lines[label].get_ydata(), list(numbers.values()))
+        # The other setting of CTCO is a line of its own, with half of the return.
+        np.testing.assert_allclose(
+            lines["CTCO (paper)"].get_ydata(), 0.5 * np.array(list(paper_returns()[task, "ctco"].values()))
+        )
+        # The first line's interval at 50 Hz, by hand: t(0.975, 1) = 12.706 times 0.2/√2/√2.
+        (_, low), (_, high) = ax.collections[0].get_segments()[0]
+        mean = 0.5 * paper_returns()[task, "ctco"][50]
+        assert (low, high) == pytest.approx((mean - 1.2706, mean + 1.2706), rel=1e-3)
+
+
+@pytest.mark.usefixtures("few_resamples")
+def test_interquartile_means_are_those_of_rliable():
+    estimates = plots.interquartile_means(synthetic(), "discounted_return")
+    tau = -math.log(0.98) / 0.05
+    returns = [paper_returns()[task, "sac"][50] for task in ("point_mass", "cheetah", "ball_in_cup")]
+    scores = tau * np.array([[value - 0.1 for value in returns], [value + 0.1 for value in returns]])
+    mean, low, high = estimates["sac", "large"][50]
+    assert mean == pytest.approx(aggregate_iqm(scores))
+    assert low < mean < high
+    # Without one task of one seed, the other seed remains, and there is no interval.
+    holed = [one for one in synthetic() if not (one["algorithm"] == "sac" and one["seed"] == 1 and one["task"] == "cheetah")]
+    mean, low, high = plots.interquartile_means(holed, "discounted_return")["sac", "large"][50]
+    assert mean == pytest.approx(aggregate_iqm(scores[:1]))
+    assert math.isnan(low)
+    assert math.isnan(high)
+
+
+@pytest.mark.usefixtures("few_resamples")
+def test_the_table_stands_beside_the_papers_numbers():
+    estimates = {"discounted_return": plots.interquartile_means(synthetic(), "discounted_return")}
+    lines = plots.table(synthetic(), estimates).splitlines()
+    training = lines[: lines.index("## Discounted return, greedy episodes")]
+    assert "| cheetah run | SAC | large | 2 | 1.07 ± 1.27 | 0.15 ± 1.27 | 0.06 ± 1.27 | 0.07 ± 1.27 |" in training
+    assert "| cheetah run | SAC | *the paper's figure* | 30 | 1.07 | 0.15 | 0.06 | 0.07 |" in training
+    assert "| cheetah run | SAC | large | 2 | 1.27 ± 1.27 | 0.35 ± 1.27 | 0.26 ± 1.27 | 0.27 ± 1.27 |" in lines
+    assert any(line.startswith("| training | CTCO | tuned | ") and "[" in line for line in lines)
+    assert lines[0].startswith("Preset quick (2400 s of task time); 2 seeds; commit abc1234.")
+    assert "| cheetah run | SAC | large | 1 | 0.97 | 0.05 | -0.04 | -0.03 |" in plots.table(synthetic(1), {})
+
+
+@pytest.mark.usefixtures("few_resamples")
+def test_plot_of_a_csv_file_and_of_a_folder(finished, tmp_path, capsys):
+    file = write_csv(tmp_path / "quick.csv", synthetic())
+    assert main(["plot", str(file), "--output", str(tmp_path / "figures")]) == 0
+    names = {path.name for path in (tmp_path / "figures").iterdir()}
+    drawn = ("frequency", "frequency_greedy", "decision_rates", "interquartile_means")
+    assert names == {f"{name}.{ending}" for name in drawn for ending in ("png", "svg")} | {"table.md"}
+    for name in drawn:
+        picture = mpl.image.imread(tmp_path / "figures" / f"{name}.png")
+        assert picture[..., :3].std() > 0.05  # not blank
+    assert "FiGAR-SAC (large)" in (tmp_path / "figures" / "frequency.svg").read_text()
+
+    _, folder = finished
+    assert main(["plot", str(folder), "--output", str(tmp_path / "tiny")]) == 0
+    assert "learning_curves.png" in capsys.readouterr().out
+    (axes,) = plots.draw_learning_curves(folder).axes
+    seconds = np.array([50, 60, 70, 80, 90, 100])
+    returns = [float(row["discounted_return"]) for row in csv.DictReader(next(folder.glob("*seed0/monitor.csv")).open())]
+    line = axes.get_lines()[0]
+    np.testing.assert_allclose(line.get_xdata(), seconds / 60)
+    # Half of ten episodes is the window.
+    np.testing.assert_allclose(line.get_ydata(), [np.mean(returns[i : i + 5]) for i in range(6)])
+
+
+def test_status_estimates_the_time_left(finished, tmp_path, capsys):
+    _, original = finished
+    folder = tmp_path / "study"
+    shutil.copytree(original, folder)
+    first, second = sorted(folder.iterdir())
+    record = json.loads((first / "record.json").read_text())
+    (first / "record.json").write_text(json.dumps({**record, "wall_seconds": 7200.0}))
+    (second / "record.json").unlink()
+    (second / "monitor.csv").write_text(
+        "task_seconds,discounted_return,decision_rate_hz,wall_seconds\n10.0,0.5,3.0,1000.0\n25.0,1.5,3.0,1800.0\n"
+    )
+    with runs.lock(second):
+        assert main(["status", str(folder)]) == 0
+    # Both take 7,200 s: of the second a quarter is done.
+    assert capsys.readouterr().out == (
+        "1 of 2 runs done, 1 running, 1 h 30 min left\nrunning point_mass-ctco_small-50hz-seed1: 25 %, return 1.00\n"
+    )
+
+
+@pytest.mark.slow
+def test_the_smoke_preset(tmp_path):
+    folder = tmp_path / "smoke"
+    assert main(["run", "--preset", "smoke", "--folder", str(folder), "--workers", "2"]) == 0
+    records = read_records(folder)
+    assert len(records) == 24
+    assert {record["algorithm"] for record in records} == set(ALGORITHMS)
+    for record in records:
+        assert 0.0 <= record["discounted_return"] <= 2.48
+        assert record["updates"] == pytest.approx(100 if record["algorithm"] == "dac_ppo" else 80, abs=2)
+        if record["algorithm"] in ("sac", "dac_ppo"):
+            assert record["decision_rate_hz"] == pytest.approx(1 / record["dt"])
+        else:
+            assert record["decision_rate_hz"] < 1 / record["dt"]
+    assert main(["plot", str(folder)]) == 0
+    assert "FiGAR-SAC" in (folder / "figures" / "table.md").read_text()
