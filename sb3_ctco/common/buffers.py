@@ -97,7 +97,8 @@ class _OptionStorage(ReplayBuffer):
         count = len(sub_options)
         if count == 0:
             return
-        rows = (self.pos + np.arange(count)) % self.buffer_size
+        end = self.pos + count
+        rows = slice(self.pos, end) if end <= self.buffer_size else np.arange(self.pos, end) % self.buffer_size
         for stored, values in (
             (self.observations, sub_options.observations),
             (self.next_observations, sub_options.next_observations),
@@ -113,8 +114,8 @@ class _OptionStorage(ReplayBuffer):
         self.durations[rows, 0] = sub_options.durations
         self.dones[rows, 0] = sub_options.terminated | sub_options.truncated
         self.timeouts[rows, 0] = sub_options.truncated & self.handle_timeout_termination
-        self.full = self.full or self.pos + count >= self.buffer_size
-        self.pos = (self.pos + count) % self.buffer_size
+        self.full = self.full or end >= self.buffer_size
+        self.pos = end % self.buffer_size
 
     def _sample_fields(self, batch_inds: np.ndarray, env: VecNormalize | None) -> dict[str, Any]:
         # ReplayBuffer._get_samples of Stable-Baselines3 2.9 has no place for further fields, so it is written anew;
