@@ -88,7 +88,8 @@ def basis(phase: FloatArray, n_rbf: int) -> FloatArray:
     :return: shape ``[n_steps, n_rbf]``
     """
     centres, variance = _centres_and_variance(n_rbf)
-    activation = np.exp(-((np.asarray(phase)[:, None] - centres) ** 2) / (2 * variance))
+    distance = np.asarray(phase)[:, None] - centres
+    activation = np.exp(distance * distance / (-2.0 * variance))
     return activation / activation.sum(axis=1, keepdims=True)
 
 
