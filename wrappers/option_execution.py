@@ -383,9 +383,10 @@ class OptionExecutionWrapper(gym.Wrapper, RecordConstructorArgs):
                     break
             if terminated or truncated:
                 break
-            observations.append(deepcopy(obs))
+            if last < len(actions):
+                observations.append(deepcopy(obs))
         if observe:
-            info["observations"] = observations[: len(observe)]
+            info["observations"] = observations
         return obs, rewards, terminated, truncated, info
 
 
