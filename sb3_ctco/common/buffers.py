@@ -9,6 +9,7 @@ from stable_baselines3.common.buffers import DictReplayBuffer, ReplayBuffer
 from stable_baselines3.common.type_aliases import DictReplayBufferSamples, ReplayBufferSamples
 from stable_baselines3.common.vec_env import VecNormalize
 
+from sb3_ctco.common.vec_env import PENDING
 from sb3_ctco.options import DEFAULT_DISCOUNT_RATE, discount
 from sb3_ctco.wrappers import SubOptions
 
@@ -58,28 +59,29 @@ class _OptionStorage(ReplayBuffer):
         """Store one decision of each environment, and the sub-options that it contained.
 
         :param infos: each with ``info["option"]`` of :class:`~sb3_ctco.wrappers.OptionExecutionWrapper`, and
-            ``info["sub_options"]`` if it hands over any
+            ``info["sub_options"]`` if it hands over any; nothing is stored of environments whose option runs on
+            (``info["pending"]`` of :class:`~sb3_ctco.common.vec_env.AsyncOptionVecEnv`)
         :raises ValueError: if that is missing, not finite, or was discounted at another rate; nothing is stored then
         """
         try:
-            options = [info["option"] for info in infos]
+            options = {i: info["option"] for i, info in enumerate(infos) if PENDING not in info}
         except KeyError:
             raise ValueError(
                 f"{type(self).__name__} needs info['option']: wrap the environment with "
                 "sb3_ctco.wrappers.OptionExecutionWrapper"
             ) from None
-        durations = np.array([option["duration"] for option in options])
-        integrated_rewards = np.array([option["integrated_reward"] for option in options])
+        durations = np.array([option["duration"] for option in options.values()])
+        integrated_rewards = np.array([option["integrated_reward"] for option in options.values()])
         if not np.isfinite(integrated_rewards).all():
             raise ValueError(f"an option's integrated reward is not finite: {integrated_rewards}")
-        discounts = np.array([option["discount"] for option in options])
+        discounts = np.array([option["discount"] for option in options.values()])
         if not np.allclose(discounts, discount(durations, self.discount_rate)):
             raise ValueError(
                 f"the environment discounts an option of {durations} s by {discounts}, this buffer, at discount_rate="
                 f"{self.discount_rate}, by {discount(durations, self.discount_rate)}: give both the same discount_rate"
             )
-        for i, info in enumerate(infos):
-            position, row = self.pos, slice(i, i + 1)
+        for i, option in options.items():
+            position, row, info = self.pos, slice(i, i + 1), infos[i]
             super().add(
                 _rows(obs, row),  # type: ignore[arg-type]
                 _rows(next_obs, row),  # type: ignore[arg-type]
@@ -88,8 +90,8 @@ class _OptionStorage(ReplayBuffer):
                 done[row],
                 [info],
             )
-            self.durations[position] = durations[i]
-            self.integrated_rewards[position] = integrated_rewards[i]
+            self.durations[position] = option["duration"]
+            self.integrated_rewards[position] = option["integrated_reward"]
             if "sub_options" in info:
                 self._add_sub_options(info["sub_options"])
 
