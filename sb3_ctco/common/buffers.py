@@ -47,6 +47,14 @@ class _OptionStorage(ReplayBuffer):
         self.durations = np.zeros((self.buffer_size, self.n_envs), dtype=np.float32)
         self.integrated_rewards = np.zeros((self.buffer_size, self.n_envs), dtype=np.float32)
 
+    @property
+    def bytes_per_transition(self) -> int:
+        """Memory of a transition, in bytes: two observations, the option, and five numbers of four bytes."""
+        arrays: list[np.ndarray] = []
+        for field in vars(self).values():
+            arrays.extend(field.values() if isinstance(field, dict) else [field])
+        return sum(array.nbytes for array in arrays if isinstance(array, np.ndarray)) // self.buffer_size
+
     def add(  # type: ignore[override]
         self,
         obs: np.ndarray | dict[str, np.ndarray],
