@@ -5,13 +5,16 @@ BIN := $(VENV)/bin
 CONSTRAINTS := constraints.txt
 export PIP_DISABLE_PIP_VERSION_CHECK = 1
 
-.PHONY: demo test lint format type commit-checks
+.PHONY: demo test bench lint format type commit-checks
 
 demo: $(VENV)/.demo
 	$(BIN)/python examples/quickstart.py
 
 test: $(VENV)/.dev
 	$(BIN)/python -m pytest -n 2 --dist worksteal tests
+
+bench: $(VENV)/.dev
+	$(BIN)/python benchmarks/run.py
 
 lint: $(VENV)/.dev
 	$(BIN)/ruff check .

@@ -1,6 +1,7 @@
 """Run a trained policy in a control loop: an observation in, an action of the bare environment or robot out."""
 
 import json
+import math
 import pickle
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
@@ -260,20 +261,19 @@ class OptionController:
         return np.stack(actions) if self._several else actions[0]
 
     def _at(self, observation: Observation, now: float) -> np.ndarray:
-        if not (np.isfinite(now) and (self._now is None or now >= self._now)):
+        if not (math.isfinite(now) and (self._now is None or now >= self._now)):
             raise ValueError(f"now must be finite and must not run backwards, and it is {now} s after {self._now} s")
         dt = self.settings.dt
         due = [i for i, e in enumerate(self._executions) if now - e.start >= (e.n_steps - 0.5) * dt]
         if due or not self._executions:
             self._decide(observation, due, now)
         self._now = now
-        actions = []
-        for e in self._executions:
-            # A late tick may find the phase past its end, where the option holds its last action.
-            phase = min((now - e.start) / (e.n_steps * dt), 1.0)
-            trajectory = basis(np.array([phase]), self.settings.n_rbf) @ e.omega.T
-            actions.append(self._box.actions(trajectory)[0])
-        return np.stack(actions) if self._several else actions[0]
+        # A late tick may find the phase past its end, where the option holds its last action.
+        phases = np.array([min((now - e.start) / (e.n_steps * dt), 1.0) for e in self._executions])
+        omega = np.array([e.omega for e in self._executions])
+        trajectory = (omega @ basis(phases, self.settings.n_rbf)[:, :, None])[:, :, 0]
+        actions = self._box.actions(trajectory)
+        return actions if self._several else actions[0]
 
     def _decide(self, observation: Observation, due: list[int], now: float) -> None:
         if not self._executions:

@@ -16,9 +16,7 @@ R              ``integrated_reward``                        reward rate × s
 ============== ============================================ ====================
 """
 
-import itertools
 import math
-from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 from typing import Any, Literal
@@ -90,7 +88,8 @@ def basis(phase: FloatArray, n_rbf: int) -> FloatArray:
     :return: shape ``[n_steps, n_rbf]``
     """
     centres, variance = _centres_and_variance(n_rbf)
-    activation = np.exp(-((np.asarray(phase)[:, None] - centres) ** 2) / (2 * variance))
+    distance = np.asarray(phase)[:, None] - centres
+    activation = np.exp(distance * distance / (-2.0 * variance))
     return activation / activation.sum(axis=1, keepdims=True)
 
 
@@ -123,34 +122,40 @@ def action_plan(omega: FloatArray, n_steps: int) -> FloatArray:
 
 
 @lru_cache(maxsize=4096)
-def _fit(n_steps: int, n_rbf: int) -> FloatArray:
-    """What turns an action plan of n steps into the weights that fit it best, ``[n_rbf, n_steps]``."""
+def _basis_and_fit(n_steps: int, n_rbf: int) -> FloatArray:
+    """φ, and what turns an action plan of n steps into the weights that fit it best: ``[n_steps, 2, n_rbf]``."""
+    matrix = basis_of_steps(n_steps, n_rbf)
     # About the plan's mean, which equal weights give exactly: where few steps leave weights open, they stay near it.
     mean = np.full((1, n_steps), 1.0 / n_steps)
-    inverse = np.linalg.pinv(basis_of_steps(n_steps, n_rbf))
-    return mean + inverse - inverse.sum(axis=1, keepdims=True) * mean
+    inverse = np.linalg.pinv(matrix)
+    return np.stack([matrix, (mean + inverse - inverse.sum(axis=1, keepdims=True) * mean).T], axis=1)
 
 
-def fit_slices(plan: FloatArray, slices: Sequence[tuple[int, int]], n_rbf: int) -> tuple[FloatArray, FloatArray]:
+def fit_slices(
+    plan: FloatArray, firsts: npt.NDArray[np.integer], ends: npt.NDArray[np.integer], n_rbf: int
+) -> tuple[FloatArray, FloatArray]:
     """The options whose actions come closest to stretches of a plan: least squares, clipped to [−1, 1].
 
     Exact for ``n_rbf=1`` and a constant plan, and for the whole plan of an option of at least n_rbf steps.
 
     :param plan: normalised actions, shape ``[n_steps, action_dim]``
-    :param slices: ``(first step, step after the last)`` of each stretch, of at least one step
+    :param firsts: the first step of each stretch, shape ``[n]``
+    :param ends: the step after its last, shape ``[n]``
     :param n_rbf: number of basis functions
     :return: ω, shape ``[n, action_dim, n_rbf]``, and the residuals, the largest deviation of an action from the plan,
         shape ``[n]``
     """
-    if not slices:
+    if not len(firsts):
         return np.empty((0, plan.shape[1], n_rbf)), np.empty(0)
-    plans = [plan[first:end] for first, end in slices]
-    omega = np.array([_fit(len(actions), n_rbf) @ actions for actions in plans]).clip(-1.0, 1.0)
-    # One row a step, the stretches one after the other
-    fitted = [basis_of_steps(len(actions), n_rbf) @ weights for actions, weights in zip(plans, omega, strict=True)]
-    deviations = np.abs(np.concatenate(fitted) - np.concatenate(plans))
-    starts = list(itertools.accumulate(map(len, plans[:-1]), initial=0))
-    return omega.swapaxes(1, 2), np.maximum.reduceat(deviations, starts, axis=0).max(axis=1)
+    lengths = ends - firsts
+    # One row a step, the stretches one after the other: they begin at the rows `starts`.
+    starts = lengths.cumsum() - lengths
+    actions = np.concatenate([plan[first:end] for first, end in zip(firsts.tolist(), ends.tolist(), strict=True)])
+    tables = np.concatenate([_basis_and_fit(length, n_rbf) for length in lengths.tolist()])
+    basis, fit = tables[:, 0], tables[:, 1]
+    omega = np.add.reduceat(actions[:, :, None] * fit[:, None], starts).clip(-1.0, 1.0)
+    fitted = np.einsum("tai,ti->ta", omega.repeat(lengths, axis=0), basis)
+    return omega, np.maximum.reduceat(np.abs(fitted - actions), starts).max(axis=1)
 
 
 class ActionBox:
@@ -247,13 +252,13 @@ class OptionSettings:
     def encode(self, omega: FloatArray, n_steps: npt.NDArray[np.integer]) -> FloatArray:
         """The option vectors that :meth:`decode` turns into these; d is encoded as 0 if d_min = d_max.
 
-        :param omega: weights, flattened, shape ``[n, action_dim · n_rbf]``
+        :param omega: weights, shape ``[n, action_dim, n_rbf]``
         :param n_steps: numbers of primitive steps, shape ``[n]``
         :return: shape ``[n, action_dim · n_rbf + 1]``, float32
         """
         width = self.d_max - self.d_min
-        options = np.zeros((len(omega), omega.shape[1] + 1), dtype=np.float32)
-        options[:, :-1] = omega
+        options = np.zeros((len(omega), omega.shape[1] * omega.shape[2] + 1), dtype=np.float32)
+        options[:, :-1] = omega.reshape(len(omega), options.shape[1] - 1)
         if width > 0:
             options[:, -1] = (2.0 * (n_steps * self.dt - self.d_min) / width - 1.0).clip(-1.0, 1.0)
         return options

@@ -184,3 +184,12 @@ def test_the_discounts_reach_sacs_target(monkeypatch):
     th.manual_seed(0)
     model.train(1, 16)
     assert model.logger.name_to_value["train/critic_loss"] == pytest.approx(expected.item(), rel=1e-5)
+
+
+def test_memory_of_a_transition():
+    assert make_buffer("vector").bytes_per_transition == 2 * 2 * 4 + 3 * 4 + 5 * 4
+    # 80×60 pixels and 21 floats, options of 7 actions of 3 weights: 100,000 fit into 3 GB.
+    space = spaces.Dict({"image": spaces.Box(0, 255, (3, 60, 80), np.uint8), "proprioception": spaces.Box(-1, 1, (21,))})
+    buffer = DictOptionReplayBuffer(10, space, spaces.Box(-1, 1, (22,)), device="cpu")
+    assert buffer.bytes_per_transition == 2 * (80 * 60 * 3 + 21 * 4) + 22 * 4 + 5 * 4 == 29_076
+    assert 100_000 * buffer.bytes_per_transition < 3e9

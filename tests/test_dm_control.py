@@ -215,6 +215,30 @@ def test_an_option_is_the_same_step_by_step(domain, task, sparse):
     assert outcomes[0][-1][1] == 500
 
 
+@pytest.mark.parametrize(("domain", "task"), [("point_mass", "hard"), ("cheetah", "run"), ("ball_in_cup", "catch")])
+@pytest.mark.parametrize("dt", [0.02, 0.002])
+def test_rolled_out_options_are_those_of_dm_controls_functions(domain, task, dt):
+    """Rewards, states and observations on the way, from arrays and from the task's own functions step by step."""
+    fast, plain = (make(domain, task, dt=dt, time_limit=100 * dt).unwrapped for _ in range(2))
+    plain._rewards = None
+    rng = np.random.default_rng(0)
+    for episode in range(3):
+        np.testing.assert_array_equal(fast.reset(seed=episode)[0], plain.reset(seed=episode)[0])
+        for n_steps in (1, 40, 59):
+            actions = np.repeat(rng.uniform(-1, 1, (n_steps // 10 + 1, *fast.action_space.shape)), 10, axis=0)[:n_steps]
+            observe = sorted({*rng.integers(1, n_steps, 5).tolist()}) if n_steps > 1 else []
+            (obs, rewards, *end, info), (obs2, rewards2, *end2, info2) = (
+                env.step_sequence(actions, observe) for env in (fast, plain)
+            )
+            np.testing.assert_array_equal(obs, obs2)
+            np.testing.assert_allclose(rewards, rewards2, rtol=0, atol=1e-9)
+            np.testing.assert_allclose(fast._physics.get_state(), plain._physics.get_state(), rtol=0, atol=1e-9)
+            np.testing.assert_array_equal(info.get("observations", []), info2.get("observations", []))
+            assert len(info.get("observations", [])) == len(observe)
+            assert end == end2
+        assert end == [False, True]
+
+
 @pytest.mark.parametrize(
     ("kwargs", "message"),
     [({"dt": 0.0}, "dt"), ({"time_limit": -1.0}, "time_limit"), ({"render_mode": "human"}, "render_mode")],

@@ -187,7 +187,7 @@ def test_settings_out_of_range(change, error):
     st.integers(1, 60),
 )
 def test_a_fit_over_the_whole_option_returns_its_weights(omega, n_steps):
-    [fitted], [residual] = fit_slices(action_plan(omega, n_steps), [(0, n_steps)], omega.shape[1])
+    [fitted], [residual] = fit_slices(action_plan(omega, n_steps), np.array([0]), np.array([n_steps]), omega.shape[1])
     if n_steps >= omega.shape[1]:  # with fewer, the weights nearest to the mean may leave the box, and are clipped
         assert residual < 1e-9
     if n_steps >= 2 * omega.shape[1]:  # enough steps to tell the weights apart
@@ -196,7 +196,7 @@ def test_a_fit_over_the_whole_option_returns_its_weights(omega, n_steps):
 
 def test_slices_of_repeated_actions_are_exact():
     plan = action_plan(np.array([[0.3], [-1.0]]), 17)
-    omega, residuals = fit_slices(plan, [(0, 1), (3, 9), (16, 17), (1, 17)], 1)
+    omega, residuals = fit_slices(plan, np.array([0, 3, 16, 1]), np.array([1, 9, 17, 17]), 1)
     np.testing.assert_allclose(omega, np.tile([[0.3], [-1.0]], (4, 1, 1)), atol=1e-12)
     assert (residuals < 1e-12).all()
 
@@ -207,9 +207,9 @@ def test_slices_of_repeated_actions_are_exact():
 )
 def test_slices_fitted_together_are_fitted_each_about_its_mean(omega, stretches):
     plan, n_rbf = action_plan(omega, 30), omega.shape[1]
-    slices = [(first, min(first + length, 30)) for first, length in stretches]
-    fitted, residuals = fit_slices(plan, slices, n_rbf)
-    for (first, end), weights, residual in zip(slices, fitted, residuals, strict=True):
+    firsts, lengths = np.array(stretches).T
+    ends = np.minimum(firsts + lengths, 30)
+    for first, end, weights, residual in zip(firsts, ends, *fit_slices(plan, firsts, ends, n_rbf), strict=True):
         actions, matrix = plan[first:end], basis_of_steps(end - first, n_rbf)
         mean = actions.mean(axis=0)
         expected = (mean + np.linalg.pinv(matrix) @ (actions - mean)).clip(-1, 1)
@@ -222,11 +222,11 @@ def test_a_fit_is_the_least_squares_one_and_says_how_far_off_it_is():
     p = 1 / (1 + math.exp(-8 / 3))
     # ω = (u, v) with pu + (1 − p)v = 0.4 and (u + v)/2 = 0.1
     v = (0.4 - 0.2 * p) / (1 - 2 * p)
-    [omega], [residual] = fit_slices(np.array([[0.4], [0.1]]), [(0, 2)], 2)
+    [omega], [residual] = fit_slices(np.array([[0.4], [0.1]]), np.array([0]), np.array([2]), 2)
     np.testing.assert_allclose(omega, [[0.2 - v, v]], atol=1e-9)
     assert residual < 1e-9
     # A plan that leaves the box of the weights is clipped, and the deviation told.
-    [omega], [residual] = fit_slices(np.array([[1.0], [-1.0]]), [(0, 2)], 2)
+    [omega], [residual] = fit_slices(np.array([[1.0], [-1.0]]), np.array([0]), np.array([2]), 2)
     assert np.abs(omega).max() <= 1.0
     plan = action_plan(omega, 2)
     assert residual == pytest.approx(np.abs(plan - [[1.0], [-1.0]]).max())
@@ -236,11 +236,11 @@ def test_a_fit_is_the_least_squares_one_and_says_how_far_off_it_is():
 def test_encode_is_the_inverse_of_decode():
     settings = OptionSettings(n_rbf=2, d_max=1.0, d_min=0.1, dt=0.1, discount_rate=0.4)
     omega = np.array([[0.1, 0.2], [-0.3, 0.4]])
-    options = settings.encode(np.tile(omega.ravel(), (10, 1)), np.arange(1, 11))
+    options = settings.encode(np.tile(omega, (10, 1, 1)), np.arange(1, 11))
     assert options.dtype == np.float32
     for n_steps, option in enumerate(options, start=1):
         again, steps = settings.decode(option)
         np.testing.assert_allclose(again, omega, rtol=1e-6)
         assert steps == n_steps
     fixed = OptionSettings(n_rbf=2, d_max=0.3, d_min=0.3, dt=0.1, discount_rate=0.4)
-    assert fixed.decode(fixed.encode(omega.reshape(1, -1), np.array([3]))[0])[1] == 3
+    assert fixed.decode(fixed.encode(omega[None], np.array([3]))[0])[1] == 3

@@ -353,28 +353,31 @@ class OptionExecutionWrapper(gym.Wrapper, RecordConstructorArgs):
         :param steps: after how many steps of the option each row of ``seen`` was observed
         """
         settings, n_ran = self.option_settings, len(rewards)
+        firsts, ends = np.array(slices, dtype=np.int64).reshape(-1, 2).T
         if n_ran < len(trajectory):
-            cut_off = [(first, min(end, n_ran)) for first, end in slices]
-            slices = [(first, end) for first, end in cut_off if end - first >= self._shortest]
-        omega, residuals = fit_slices(trajectory, slices, settings.n_rbf)
+            ends = np.minimum(ends, n_ran)
+            long_enough = ends - firsts >= self._shortest
+            firsts, ends = firsts[long_enough], ends[long_enough]
+        omega, residuals = fit_slices(trajectory, firsts, ends, settings.n_rbf)
         kept = residuals <= self.sub_option_tolerance
-        firsts, ends = np.array(slices, dtype=np.int64).reshape(-1, 2)[kept].T
+        if not kept.all():
+            firsts, ends, omega, residuals = firsts[kept], ends[kept], omega[kept], residuals[kept]
         # R of a stretch from the discounted rewards up to its ends
         discounts = discounts_of_steps(n_ran, settings.dt, settings.discount_rate)
         total = np.zeros(n_ran + 1)
-        np.cumsum(rewards * discounts, out=total[1:])
+        (rewards * discounts).cumsum(out=total[1:])
         weight = step_weight(settings.dt, settings.discount_rate) if self.reward_unit == "rate" else 1.0
-        at_end = ends == n_ran
+        lengths, at_end, rows = ends - firsts, ends == n_ran, np.array(steps)
         return SubOptions(
             seen=seen,
-            begins=np.searchsorted(steps, firsts),
-            ends=np.searchsorted(steps, ends),
-            options=settings.encode(omega[kept].reshape(len(firsts), self.action_space.shape[0] - 1), ends - firsts),
-            durations=(ends - firsts) * settings.dt,
+            begins=rows.searchsorted(firsts),
+            ends=rows.searchsorted(ends),
+            options=settings.encode(omega, lengths),
+            durations=lengths * settings.dt,
             integrated_rewards=(total[ends] - total[firsts]) * weight / discounts[firsts],
             terminated=at_end & terminated,
             truncated=at_end & truncated,
-            residuals=residuals[kept],
+            residuals=residuals,
         )
 
     def _step_in_a_loop(self, actions: np.ndarray, observe: Sequence[int] = ()) -> SequenceResult:
@@ -390,9 +393,10 @@ class OptionExecutionWrapper(gym.Wrapper, RecordConstructorArgs):
                     break
             if terminated or truncated:
                 break
-            observations.append(deepcopy(obs))
+            if last < len(actions):
+                observations.append(deepcopy(obs))
         if observe:
-            info["observations"] = observations[: len(observe)]
+            info["observations"] = observations
         return obs, rewards, terminated, truncated, info
 
 

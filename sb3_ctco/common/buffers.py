@@ -9,6 +9,7 @@ from stable_baselines3.common.buffers import DictReplayBuffer, ReplayBuffer
 from stable_baselines3.common.type_aliases import DictReplayBufferSamples, ReplayBufferSamples
 from stable_baselines3.common.vec_env import VecNormalize
 
+from sb3_ctco.common.vec_env import PENDING
 from sb3_ctco.options import DEFAULT_DISCOUNT_RATE, discount
 from sb3_ctco.wrappers import SubOptions
 
@@ -49,6 +50,14 @@ class _OptionStorage(ReplayBuffer):
         self.n_decisions = 0
         self.decision_seconds = 0.0
 
+    @property
+    def bytes_per_transition(self) -> int:
+        """Memory of a transition, in bytes: two observations, the option, and five numbers of four bytes."""
+        arrays: list[np.ndarray] = []
+        for field in vars(self).values():
+            arrays.extend(field.values() if isinstance(field, dict) else [field])
+        return sum(array.nbytes for array in arrays if isinstance(array, np.ndarray)) // self.buffer_size
+
     def add(  # type: ignore[override]
         self,
         obs: np.ndarray | dict[str, np.ndarray],
@@ -61,28 +70,29 @@ class _OptionStorage(ReplayBuffer):
         """Store one decision of each environment, and the sub-options that it contained.
 
         :param infos: each with ``info["option"]`` of :class:`~sb3_ctco.wrappers.OptionExecutionWrapper`, and
-            ``info["sub_options"]`` if it hands over any
+            ``info["sub_options"]`` if it hands over any; nothing is stored of environments whose option runs on
+            (``info["pending"]`` of :class:`~sb3_ctco.common.vec_env.AsyncOptionVecEnv`)
         :raises ValueError: if that is missing, not finite, or was discounted at another rate; nothing is stored then
         """
         try:
-            options = [info["option"] for info in infos]
+            options = {i: info["option"] for i, info in enumerate(infos) if PENDING not in info}
         except KeyError:
             raise ValueError(
                 f"{type(self).__name__} needs info['option']: wrap the environment with "
                 "sb3_ctco.wrappers.OptionExecutionWrapper"
             ) from None
-        durations = np.array([option["duration"] for option in options])
-        integrated_rewards = np.array([option["integrated_reward"] for option in options])
+        durations = np.array([option["duration"] for option in options.values()])
+        integrated_rewards = np.array([option["integrated_reward"] for option in options.values()])
         if not np.isfinite(integrated_rewards).all():
             raise ValueError(f"an option's integrated reward is not finite: {integrated_rewards}")
-        discounts = np.array([option["discount"] for option in options])
+        discounts = np.array([option["discount"] for option in options.values()])
         if not np.allclose(discounts, discount(durations, self.discount_rate)):
             raise ValueError(
                 f"the environment discounts an option of {durations} s by {discounts}, this buffer, at discount_rate="
                 f"{self.discount_rate}, by {discount(durations, self.discount_rate)}: give both the same discount_rate"
             )
-        for i, info in enumerate(infos):
-            position, row = self.pos, slice(i, i + 1)
+        for i, option in options.items():
+            position, row, info = self.pos, slice(i, i + 1), infos[i]
             super().add(
                 _rows(obs, row),  # type: ignore[arg-type]
                 _rows(next_obs, row),  # type: ignore[arg-type]
@@ -91,10 +101,10 @@ class _OptionStorage(ReplayBuffer):
                 done[row],
                 [info],
             )
-            self.durations[position] = durations[i]
-            self.integrated_rewards[position] = integrated_rewards[i]
+            self.durations[position] = option["duration"]
+            self.integrated_rewards[position] = option["integrated_reward"]
             self.n_decisions += 1
-            self.decision_seconds += float(durations[i])
+            self.decision_seconds += option["duration"]
             if "sub_options" in info:
                 self._add_sub_options(info["sub_options"])
 
@@ -102,7 +112,8 @@ class _OptionStorage(ReplayBuffer):
         count = len(sub_options)
         if count == 0:
             return
-        rows = (self.pos + np.arange(count)) % self.buffer_size
+        end = self.pos + count
+        rows = slice(self.pos, end) if end <= self.buffer_size else np.arange(self.pos, end) % self.buffer_size
         values: Any
         for stored, values in (
             (self.observations, sub_options.observations),
@@ -120,8 +131,8 @@ class _OptionStorage(ReplayBuffer):
         self.durations[rows, 0] = sub_options.durations
         self.dones[rows, 0] = sub_options.terminated | sub_options.truncated
         self.timeouts[rows, 0] = sub_options.truncated & self.handle_timeout_termination
-        self.full = self.full or self.pos + count >= self.buffer_size
-        self.pos = (self.pos + count) % self.buffer_size
+        self.full = self.full or end >= self.buffer_size
+        self.pos = end % self.buffer_size
 
     def _sample_fields(self, batch_inds: np.ndarray, env: VecNormalize | None) -> dict[str, Any]:
         # ReplayBuffer._get_samples of Stable-Baselines3 2.9 has no place for further fields, so it is written anew.

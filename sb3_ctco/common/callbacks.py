@@ -1,10 +1,13 @@
 """Time accounting: callbacks that see primitive steps while the algorithm takes decisions."""
 
+from collections import deque
 from typing import Any
 
 import numpy as np
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.callbacks import BaseCallback, ProgressBarCallback
+
+from sb3_ctco.common.vec_env import PENDING
 
 
 class PrimitiveStepCallback(BaseCallback):
@@ -16,7 +19,8 @@ class PrimitiveStepCallback(BaseCallback):
     (``dones``, ``rewards`` and ``infos`` in the child's locals) is shown at its last tick only.
 
     With several environments one tick stands for a primitive step in each of them, as in Stable-Baselines3; options
-    of different lengths are averaged, and the remainder is carried over.
+    of different lengths are averaged, and the remainder is carried over; what options brought that end one by one
+    (:class:`~sb3_ctco.common.vec_env.AsyncOptionVecEnv`) is shown together, at the next tick.
 
     :param callback: the user's callback; None if there is none
     """
@@ -24,6 +28,7 @@ class PrimitiveStepCallback(BaseCallback):
     def __init__(self, callback: BaseCallback | None):
         super().__init__()
         self.callback = callback
+        self._unseen: deque[dict[str, Any]] = deque()
 
     def init_callback(self, model: BaseAlgorithm) -> None:
         """Initialise the child, too."""
@@ -48,7 +53,7 @@ class PrimitiveStepCallback(BaseCallback):
         n_envs = self.training_env.num_envs
         # collect_rollouts has counted this decision as one step of each environment.
         before = self.model.num_timesteps - n_envs
-        after = before + sum(info["option"]["n_steps"] for info in self.locals["infos"])
+        after = before + sum(info["option"]["n_steps"] for info in self.locals["infos"] if "option" in info)
         continue_training = self._tick(before // n_envs, after // n_envs, n_envs)
         self.model.num_timesteps = after
         self.n_calls += 1
@@ -58,20 +63,30 @@ class PrimitiveStepCallback(BaseCallback):
     def _tick(self, first: int, last: int, n_envs: int) -> bool:
         if self.callback is None:
             return True
-        decision = {key: self.locals[key] for key in ("dones", "rewards", "infos")}
+        self._add_unseen({key: self.locals[key] for key in ("dones", "rewards", "infos")})
         nothing: dict[str, Any] = {
-            "dones": np.zeros_like(decision["dones"]),
-            "rewards": np.zeros_like(decision["rewards"]),
+            "dones": np.zeros(n_envs, dtype=bool),
+            "rewards": np.zeros_like(self.locals["rewards"]),
             "infos": [{} for _ in range(n_envs)],
         }
         self.callback.update_locals({**self.locals, **nothing})
         for tick in range(first + 1, last + 1):
-            if tick == last:
-                self.callback.update_locals(decision)
+            if self._unseen and last - tick < len(self._unseen):
+                self.callback.update_locals(self._unseen.popleft())
             self.model.num_timesteps = tick * n_envs
             if not self.callback.on_step():
                 return False
         return True
+
+    def _add_unseen(self, decision: dict[str, Any]) -> None:
+        """Options that end one by one (AsyncOptionVecEnv) may take fewer steps than there are environments: no tick."""
+        pending = [PENDING in info for info in decision["infos"]]
+        if self._unseen and all(p or PENDING in info for p, info in zip(pending, self._unseen[-1]["infos"], strict=True)):
+            last = self._unseen[-1]
+            for i in np.flatnonzero(np.logical_not(pending)):
+                last["dones"][i], last["rewards"][i], last["infos"][i] = (decision[key][i] for key in decision)
+        else:
+            self._unseen.append(decision)
 
     def _on_step(self) -> bool:
         return True

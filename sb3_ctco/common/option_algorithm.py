@@ -27,6 +27,7 @@ from stable_baselines3.common.type_aliases import (
 )
 from stable_baselines3.common.vec_env import (
     VecEnv,
+    VecEnvWrapper,
     VecFrameStack,
     VecTransposeImage,
     unwrap_vec_normalize,
@@ -35,6 +36,7 @@ from stable_baselines3.common.vec_env import (
 
 from sb3_ctco.common.buffers import DictOptionReplayBuffer, OptionReplayBuffer
 from sb3_ctco.common.callbacks import OptionProgressBarCallback, PrimitiveStepCallback
+from sb3_ctco.common.vec_env import PLAYED, AsyncOptionVecEnv
 from sb3_ctco.options import OptionSettings, discount_rate_from_gamma
 from sb3_ctco.wrappers import OptionExecutionWrapper, SubOptions, find_dt
 
@@ -198,6 +200,15 @@ class OptionOffPolicyAlgorithm(OffPolicyAlgorithm):
                 "sub-options begin at single observations, which VecFrameStack does not stack: stack frames inside, with "
                 "gymnasium.wrappers.FrameStackObservation, or pass n_sub_options=0"
             )
+        if isinstance(env.unwrapped, AsyncOptionVecEnv):
+            wrapper = env
+            while isinstance(wrapper, VecEnvWrapper):
+                if not isinstance(wrapper, VecTransposeImage):
+                    raise ValueError(
+                        f"{type(wrapper).__name__} would count an observation again while the option that began with it "
+                        "runs on in AsyncOptionVecEnv: use SubprocVecEnv, or a Gymnasium wrapper inside"
+                    )
+                wrapper = wrapper.venv
         settings: list[OptionSettings] = env.get_attr("option_settings")
         expected = {
             "n_rbf": self.n_rbf,
@@ -337,12 +348,14 @@ class OptionOffPolicyAlgorithm(OffPolicyAlgorithm):
         dones: np.ndarray,
         infos: list[dict[str, Any]],
     ) -> None:
-        for info in infos:
+        for i, info in enumerate(infos):
             if "sub_options" in info:
                 self._residuals_since_log.extend(info["sub_options"].residuals)
                 info["sub_options"] = self._as_stored(info["sub_options"])
+            if PLAYED in info:
+                buffer_action[i] = self.policy.scale_action(info[PLAYED])
         super()._store_transition(replay_buffer, buffer_action, new_obs, reward, dones, infos)
-        self._durations_since_log.extend(info["option"]["duration"] for info in infos)
+        self._durations_since_log.extend(info["option"]["duration"] for info in infos if "option" in info)
 
     def _as_stored(self, sub_options: SubOptions) -> SubOptions:
         """Sub-options come past the wrappers of the VecEnv, of which VecTransposeImage changes what is stored."""
