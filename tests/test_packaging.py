@@ -74,6 +74,14 @@ def test_an_installation_works_outside_the_checkout(tmp_path, wheel, kind):
 def test_the_wheel_holds_the_package_and_nothing_else(wheel):
     names = zipfile.ZipFile(wheel).namelist()
     assert {name.split("/")[0].split("-")[0] for name in names} == {"sb3_ctco"}
-    for wanted in ("py.typed", "wrappers/option_execution.py", "zoo_configs/ctco.yml", "ctco/ctco.py", "options.py"):
+    for wanted in (
+        "study/presets/quick.yml",
+        "study/figure_frequency.csv",
+        "py.typed",
+        "wrappers/option_execution.py",
+        "zoo_configs/ctco.yml",
+        "ctco/ctco.py",
+        "options.py",
+    ):
         assert f"sb3_ctco/{wanted}" in names
     assert any(name.endswith("licenses/LICENSE") for name in names)

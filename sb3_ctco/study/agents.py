@@ -1,6 +1,7 @@
 """From a run's settings to a model to train, and an environment to evaluate it in."""
 
 import inspect
+from collections.abc import Callable
 from typing import Any
 
 import gymnasium as gym
@@ -19,7 +20,12 @@ from sb3_ctco.study.grid import EPISODE_SECONDS, Run
 from sb3_ctco.wrappers import RewardRateWrapper
 
 #: What may be an argument in a preset file, beside those in seconds
-_SIGNATURES = {"ctco": [CTCO], "figar_sac": [FiGARSAC], "dac_ppo": [DACPPO], "sac": [sac_at_rate, SAC]}
+_SIGNATURES: dict[str, list[Callable[..., Any]]] = {
+    "ctco": [CTCO],
+    "figar_sac": [FiGARSAC],
+    "dac_ppo": [DACPPO],
+    "sac": [sac_at_rate, SAC],
+}
 
 
 def constructor_arguments(run: Run) -> dict[str, Any]:
@@ -32,7 +38,7 @@ def constructor_arguments(run: Run) -> dict[str, Any]:
         arguments["learning_starts"] = round(arguments.pop("learning_starts_seconds") * run.rate)
     if run.algorithm == "dac_ppo" and "rollout_seconds" in arguments:
         arguments["n_steps"] = round(arguments.pop("rollout_seconds") * run.rate / n_envs(run))
-    known = {name for callable_ in _SIGNATURES[run.algorithm] for name in inspect.signature(callable_).parameters}
+    known = {name for constructor in _SIGNATURES[run.algorithm] for name in inspect.signature(constructor).parameters}
     unknown = sorted(set(arguments) - known)
     if unknown:
         raise ValueError(f"preset {run.preset}: {run.algorithm} ({run.setting}) has no arguments {unknown}")

@@ -1,5 +1,6 @@
 """Where runs are made: in worker processes of this machine (joblib), or on Ray."""
 
+import logging
 import os
 from collections.abc import Iterator, Sequence
 from pathlib import Path
@@ -55,8 +56,13 @@ def run_on_ray(runs: Sequence[Run], folder: Path, workers: int, address: str | N
     except ImportError as error:
         raise ImportError("--engine ray needs Ray: pip install 'sb3-ctco[ray]'") from error
 
-    local = {} if address else {"num_cpus": workers, "include_dashboard": False}
-    ray.init(address=address, logging_level="warning", log_to_driver=False, **local)
+    ray.init(
+        address=address,
+        num_cpus=None if address else workers,
+        include_dashboard=None if address else False,
+        logging_level=logging.WARNING,
+        log_to_driver=False,
+    )
     try:
         task = ray.remote(num_cpus=1, max_retries=RETRIES)(perform)
         pending = {task.remote(run, folder): run for run in runs}

@@ -94,7 +94,13 @@ class Preset:
         :raises ValueError: if a filter names what no run of the preset has
         """
         chosen = list(self.runs)
-        filters = {"task": tasks, "rate": rates, "algorithm": algorithms, "setting": settings, "seed": seeds}
+        filters: dict[str, Sequence[Any] | None] = {
+            "task": tasks,
+            "rate": rates,
+            "algorithm": algorithms,
+            "setting": settings,
+            "seed": seeds,
+        }
         for name, wanted in filters.items():
             if wanted is None:
                 continue

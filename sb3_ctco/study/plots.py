@@ -78,7 +78,7 @@ def interquartile_means(records: Sequence[Record], metric: str) -> Estimates:
 
     tasks = tasks_of(records)
     values = {
-        (record["algorithm"], record["setting"], _rate(record), record["seed"], record["task"]): record[metric]
+        ((record["algorithm"], record["setting"]), _rate(record), record["seed"], record["task"]): record[metric]
         for record in records
     }
     rates = sorted({_rate(record) for record in records})
@@ -86,10 +86,10 @@ def interquartile_means(records: Sequence[Record], metric: str) -> Estimates:
     estimates: Estimates = {}
     for line in lines_of(records):
         for rate in rates:
-            complete = [seed for seed in seeds if all((*line, rate, seed, task) in values for task in tasks)]
+            complete = [seed for seed in seeds if all((line, rate, seed, task) in values for task in tasks)]
             if not complete:
                 continue
-            scores = np.array([[values[(*line, rate, seed, task)] for task in tasks] for seed in complete])
+            scores = np.array([[values[line, rate, seed, task] for task in tasks] for seed in complete])
             scores = scores * DEFAULT_DISCOUNT_RATE
             low = high = math.nan
             if len(complete) > 1:

@@ -110,14 +110,15 @@ def _read_run(path: Path) -> RunStatus:
         record = json.loads((path / RECORD).read_text(encoding="utf-8"))
         return RunStatus(path.name, cell, "done", 1.0, record["wall_seconds"], record["discounted_return"])
     if is_running(path):
-        return RunStatus(path.name, cell, "running", **_progress(path, settings))
+        return RunStatus(path.name, cell, "running", *_progress(path, settings))
     if (path / ERROR).exists():
         error = (path / ERROR).read_text(encoding="utf-8").strip().splitlines()[-1]
         return RunStatus(path.name, cell, "failed", error=error)
     return RunStatus(path.name, cell, "waiting")
 
 
-def _progress(path: Path, settings: dict[str, Any]) -> dict[str, float]:
+def _progress(path: Path, settings: dict[str, Any]) -> tuple[float, float, float]:
+    """Fraction of task time, wall time in s, and recent return, from the episodes so far."""
     try:
         with (path / MONITOR).open(newline="") as file:
             # The last row may be half written.
@@ -125,12 +126,12 @@ def _progress(path: Path, settings: dict[str, Any]) -> dict[str, float]:
     except FileNotFoundError:
         rows = []
     if not rows:
-        return {}
-    return {
-        "progress": min(float(rows[-1]["task_seconds"]) / settings["task_seconds"], 1.0),
-        "wall_seconds": float(rows[-1]["wall_seconds"]),
-        "recent_return": float(np.mean([float(row["discounted_return"]) for row in rows[-RECENT:]])),
-    }
+        return 0.0, 0.0, math.nan
+    return (
+        min(float(rows[-1]["task_seconds"]) / settings["task_seconds"], 1.0),
+        float(rows[-1]["wall_seconds"]),
+        float(np.mean([float(row["discounted_return"]) for row in rows[-RECENT:]])),
+    )
 
 
 def _clock(seconds: float) -> str:
