@@ -212,7 +212,7 @@ class DMControlEnv(gym.Env[np.ndarray, np.ndarray]):
         joints = states[0, n_sub_steps - 1 :: n_sub_steps, 1 : 1 + model.nq + model.nv]
         assert self._rewards is not None
         rewards = self._rewards(joints[:, : model.nq], sensors[0, n_sub_steps::n_sub_steps], ctrl[0, ::n_sub_steps])
-        return rewards, None, joints[[k - 1 for k in observe], self._first_joint :].astype(np.float32)
+        return rewards, None, list(joints[[k - 1 for k in observe], self._first_joint :].astype(np.float32))
 
     def render(self) -> np.ndarray | None:  # type: ignore[override]
         """A frame, uint8 ``[height, width, 3]``, if ``render_mode`` is ``"rgb_array"``."""
