@@ -19,7 +19,7 @@ from gymnasium.error import ResetNeeded
 from stable_baselines3 import PPO, SAC
 from stable_baselines3.common.callbacks import BaseCallback, CheckpointCallback
 
-from sb3_ctco import CTCO, OptionExecutionWrapper
+from sb3_ctco import CTCO, FiGARSAC, OptionExecutionWrapper
 from sb3_ctco.realtime import AsynchronousTrainer, JournalReader, JournalWriter, LearnerError
 from sb3_ctco.realtime.weights import SharedWeights
 from sb3_ctco.wrappers import RealTimeOptionWrapper
@@ -120,7 +120,7 @@ class Watcher(BaseCallback):
         return True
 
 
-@pytest.mark.parametrize("algorithm", [SAC, CTCO])
+@pytest.mark.parametrize("algorithm", [SAC, CTCO, FiGARSAC])
 def test_learns_elsewhere_and_everything_comes_back(tmp_path, algorithm):
     env = Point()
     model = make_model(algorithm, env)
@@ -226,7 +226,7 @@ class KillLearner(BaseCallback):
         return True
 
 
-@pytest.mark.parametrize("algorithm", [SAC, CTCO])
+@pytest.mark.parametrize("algorithm", [SAC, CTCO, FiGARSAC])
 def test_killed_learner_is_reported_and_the_machine_made_safe(tmp_path, algorithm):
     env = Point()
     stopped = []
