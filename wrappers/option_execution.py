@@ -415,12 +415,13 @@ def _time_limited(env: TimeLimit, play: StepSequence) -> StepSequence:
     """Keep a TimeLimit's count over a sequence of steps that it does not see one by one."""
 
     def step_sequence(actions: np.ndarray, observe: Sequence[int] = ()) -> SequenceResult:
-        assert env._elapsed_steps is not None
-        actions = actions[: max(1, env._max_episode_steps - env._elapsed_steps)]
+        elapsed: int = env._elapsed_steps  # type: ignore[assignment]  # reset() has set it
+        actions = actions[: max(1, env._max_episode_steps - elapsed)]
         on_the_way = [k for k in observe if k < len(actions)]
         obs, rewards, terminated, truncated, info = play(actions, on_the_way) if on_the_way else play(actions)
-        env._elapsed_steps += len(rewards)  # type: ignore[arg-type]
-        return obs, rewards, terminated, truncated or env._elapsed_steps >= env._max_episode_steps, info
+        elapsed += len(rewards)  # type: ignore[arg-type]
+        env._elapsed_steps = elapsed  # type: ignore[assignment]
+        return obs, rewards, terminated, truncated or elapsed >= env._max_episode_steps, info
 
     return step_sequence
 
