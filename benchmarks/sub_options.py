@@ -41,7 +41,7 @@ def seconds_of_interaction(env_id: str, d_max: float, n_sub_options: int, second
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--n", type=int, default=8, help="sub-options of an option")
-    parser.add_argument("--seconds", type=float, default=200.0, help="task time of a repeat")
+    parser.add_argument("--seconds", type=float, default=60.0, help="task time of a repeat")
     parser.add_argument("--repeats", type=int, default=5)
     args = parser.parse_args()
     th.set_num_threads(1)

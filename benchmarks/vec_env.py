@@ -70,7 +70,7 @@ def steps_a_second(vec_env_cls: type[SubprocVecEnv], seconds: list[float], d_max
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--milliseconds", type=float, default=5.0, help="time of a step")
-    parser.add_argument("--steps", type=int, default=6_000)
+    parser.add_argument("--steps", type=int, default=3_000)
     parser.add_argument("--repeats", type=int, default=3)
     args = parser.parse_args()
     th.set_num_threads(1)

@@ -15,7 +15,7 @@ import numpy.typing as npt
 from gymnasium import spaces
 from gymnasium.error import ResetNeeded
 from gymnasium.utils import RecordConstructorArgs
-from gymnasium.wrappers import OrderEnforcing, PassiveEnvChecker
+from gymnasium.wrappers import OrderEnforcing, PassiveEnvChecker, TimeLimit
 from stable_baselines3.common.monitor import Monitor
 
 from sb3_ctco.options import (
@@ -30,6 +30,7 @@ from sb3_ctco.options import (
     integrated_reward,
     step_weight,
 )
+from sb3_ctco.wrappers.gymnasium_mujoco import find_rollout
 
 SequenceResult = tuple[Any, npt.ArrayLike, bool, bool, dict[str, Any]]
 StepSequence = Callable[..., SequenceResult]
@@ -139,8 +140,8 @@ class OptionExecutionWrapper(gym.Wrapper, RecordConstructorArgs):
 
     The order of wrappers is ``OptionExecutionWrapper(Monitor(TimeLimit(env)))``: what is inside sees primitive steps.
     If the inner environment offers ``step_sequence`` (:class:`SupportsStepSequence`), directly or below nothing but
-    Stable-Baselines3's ``Monitor`` and Gymnasium's ``OrderEnforcing`` and ``PassiveEnvChecker``, it is called in
-    place of the loop over ``step``.
+    Stable-Baselines3's ``Monitor`` and Gymnasium's ``TimeLimit``, ``OrderEnforcing`` and ``PassiveEnvChecker``, it is
+    called in place of the loop over ``step``. Gymnasium's HalfCheetah, Swimmer, Hopper and Walker2d (v5) are given one.
 
     Example:
         >>> import gymnasium as gym
@@ -414,7 +415,25 @@ def _find_step_sequence(env: gym.Env, observing: bool) -> StepSequence | None:
     if type(env) is Monitor:
         inner = _find_step_sequence(env.env, observing)
         return None if inner is None else _monitored(env, inner)
-    return None
+    if type(env) is TimeLimit:
+        inner = _find_step_sequence(env.env, observing)
+        return None if inner is None else _time_limited(env, inner)
+    return find_rollout(env)
+
+
+def _time_limited(env: TimeLimit, play: StepSequence) -> StepSequence:
+    """Keep a TimeLimit's count over a sequence of steps that it does not see one by one."""
+
+    def step_sequence(actions: np.ndarray, observe: Sequence[int] = ()) -> SequenceResult:
+        elapsed: int = env._elapsed_steps  # type: ignore[assignment]  # reset() has set it
+        actions = actions[: max(1, env._max_episode_steps - elapsed)]
+        on_the_way = [k for k in observe if k < len(actions)]
+        obs, rewards, terminated, truncated, info = play(actions, on_the_way) if on_the_way else play(actions)
+        elapsed += len(rewards)  # type: ignore[arg-type]
+        env._elapsed_steps = elapsed  # type: ignore[assignment]
+        return obs, rewards, terminated, truncated or elapsed >= env._max_episode_steps, info
+
+    return step_sequence
 
 
 def _monitored(monitor: Monitor, play: StepSequence) -> StepSequence:

@@ -25,7 +25,7 @@ except ImportError as error:  # pragma: no cover
 Rewards = Callable[[np.ndarray, np.ndarray, np.ndarray], np.ndarray]
 
 #: Rewards of the steps that ran, dm_control's discount if the episode ended, and the observations on the way
-_Played = tuple[np.ndarray, float | None, Sequence[np.ndarray]]
+_Played = tuple[np.ndarray, float | None, Sequence[np.ndarray] | np.ndarray]
 _STATE = int(mujoco.mjtState.mjSTATE_FULLPHYSICS)
 
 
