@@ -15,8 +15,8 @@ from pathlib import Path
 
 FOLDER = Path(__file__).parent
 README = FOLDER / "README.md"
-#: Each script prints one table; what does not exist is left out.
-SCRIPTS = ("updates", "env_step", "wrapper", "sub_options", "vec_env", "controller", "imports", "memory")
+#: Each script prints one table.
+SCRIPTS = ("updates", "training", "env_step", "wrapper", "sub_options", "vec_env", "controller", "imports", "memory")
 PACKAGES = ("stable-baselines3", "gymnasium", "torch", "numpy", "mujoco", "dm-control")
 
 
@@ -61,13 +61,12 @@ def write(script: str, text: str) -> None:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    present = [script for script in SCRIPTS if (FOLDER / f"{script}.py").exists()]
-    parser.add_argument("scripts", nargs="*", metavar="script", help=f"all by default: {' '.join(present)}")
+    parser.add_argument("scripts", nargs="*", metavar="script", help=f"all by default: {' '.join(SCRIPTS)}")
     args = parser.parse_args()
-    if unknown := {*args.scripts} - {*present}:
-        parser.error(f"there is no {' '.join(sorted(unknown))}; these exist: {' '.join(present)}")
+    if unknown := {*args.scripts} - {*SCRIPTS}:
+        parser.error(f"there is no {' '.join(sorted(unknown))}; these exist: {' '.join(SCRIPTS)}")
     where = setting()
-    for script in args.scripts or present:
+    for script in args.scripts or SCRIPTS:
         print(f"{script} ...", flush=True)
         table = table_of(script)
         write(script, f"\n{table}\n\n{where}\n")
