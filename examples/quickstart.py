@@ -67,12 +67,7 @@ def main() -> None:
         batch_size=100,
         tau=0.01,
         updates_per_second=20,
-        n_rbf=3,
-        n_sub_options=8,
         d_max=0.5,
-        high_freq_penalty=0.003,
-        ent_coef="auto_0.02",
-        duration_ent_coef="auto_0.02",
         # More random than by default, −dim(ω): a sparse reward must be found before anything can be learned.
         target_entropy=0.0,
         buffer_size=200_000,
