@@ -504,7 +504,7 @@ def test_the_smoke_preset(tmp_path):
     folder = tmp_path / "smoke"
     assert main(["run", "--preset", "smoke", "--folder", str(folder), "--workers", "2"]) == 0
     records = read_records(folder)
-    assert len(records) == 24
+    assert len(records) == 16
     assert {record["algorithm"] for record in records} == set(ALGORITHMS)
     for record in records:
         assert 0.0 <= record["discounted_return"] <= 2.48
