@@ -72,7 +72,7 @@ def wait_for(condition, seconds: float = 60.0) -> None:
 
 
 def test_the_presets_are_the_grids_that_they_should_be():
-    assert preset_names() == ["paper", "quick", "smoke"]
+    assert preset_names() == ["learning", "paper", "quick", "smoke"]
     paper, quick = load_preset("paper"), load_preset("quick")
     assert len(paper.select(settings=["paper"])) == 30 * 4 * 3 * 4
     assert {run.task_seconds for run in paper.runs} == {400 * 60}
