@@ -143,7 +143,7 @@ def test_mistakes_in_a_preset(tmp_path, changes, message):
 def test_mistakes_on_the_command_line(tmp_path, capsys):
     preset = tiny(tmp_path, algorithms={"ctco": {"setting": "a", "arguments": {"gama": 0.9}}})
     for arguments, message in [
-        (["run", "--preset", "none"], "no preset 'none': name one of ['paper', 'quick', 'smoke'], or a YAML file"),
+        (["run", "--preset", "none"], "no preset 'none': name one of ['learning', 'paper', 'quick', 'smoke'], or a YAML file"),
         (["run", "--preset", "quick", "--rates", "60"], "preset quick has no rate [60]; it has [50, 100, 250, 500]"),
         (["run", "--preset", preset], "ctco (a) has no arguments ['gama']"),
         (["run", "--preset", preset, "--workers", "0"], "--workers must be at least 1, not 0"),

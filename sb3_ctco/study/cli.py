@@ -35,7 +35,7 @@ def _parser() -> argparse.ArgumentParser:
     commands = parser.add_subparsers(dest="command", required=True)
 
     run = commands.add_parser("run", help="make the runs that are missing", description="Make the runs that are missing.")
-    run.add_argument("--preset", required=True, help="smoke, quick, paper, or a YAML file")
+    run.add_argument("--preset", required=True, help="smoke, quick, learning, paper, or a YAML file")
     run.add_argument("--folder", type=Path, help="where the runs go; runs/study/PRESET by default")
     run.add_argument("--workers", type=int, help="number of processes; one a core by default")
     run.add_argument("--engine", choices=("local", "ray"), default="local", help="processes of this machine, or Ray")
