@@ -271,7 +271,13 @@ def test_shimmys_environments_work_under_the_wrapper():
         env = gym.make("dm_control/ball_in_cup-catch-v0")
         assert find_dt(env) == pytest.approx(0.02)
         model = CTCO(
-            "MultiInputPolicy", env, policy_kwargs={"net_arch": [8]}, learning_starts=50, gradient_steps=1, buffer_size=1000
+            "MultiInputPolicy",
+            env,
+            policy_kwargs={"net_arch": [8]},
+            learning_starts=50,
+            gradient_steps=1,
+            n_sub_options=0,
+            buffer_size=1000,
         )
         model.learn(150)
     assert model.num_timesteps >= 150

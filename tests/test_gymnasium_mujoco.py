@@ -48,3 +48,13 @@ def test_others_are_stepped(scripted_env):
     assert find_rollout(Mine()) is None
     assert find_rollout(gym.make("InvertedPendulum-v5").unwrapped) is None
     assert find_rollout(scripted_env()) is None
+
+
+def test_below_the_time_limit_that_rl_zoo_puts_in_place_of_gymnasium_s():
+    pytest.importorskip("rl_zoo3.gym_patches")
+    env = OptionExecutionWrapper(gym.make("HalfCheetah-v5", max_episode_steps=7), d_max=0.5)
+    assert "PatchedTimeLimit" in str(env)
+    env.reset(seed=0)
+    assert env._play != env._step_in_a_loop
+    _, _, terminated, truncated, info = env.step([0.0] * 18 + [1.0])
+    assert (terminated, truncated, info["option"]["n_steps"], info["TimeLimit.truncated"]) == (False, True, 7, True)

@@ -15,7 +15,7 @@ import numpy.typing as npt
 from gymnasium import spaces
 from gymnasium.error import ResetNeeded
 from gymnasium.utils import RecordConstructorArgs
-from gymnasium.wrappers import OrderEnforcing, PassiveEnvChecker, TimeLimit
+from gymnasium.wrappers import OrderEnforcing, PassiveEnvChecker
 from stable_baselines3.common.monitor import Monitor
 
 from sb3_ctco.options import (
@@ -35,6 +35,10 @@ from sb3_ctco.wrappers.gymnasium_mujoco import find_rollout
 SequenceResult = tuple[Any, npt.ArrayLike, bool, bool, dict[str, Any]]
 StepSequence = Callable[..., SequenceResult]
 Stacked = np.ndarray | dict[str, np.ndarray]
+
+
+#: Gymnasium's TimeLimit, and that which RL Zoo puts in its place
+_TIME_LIMITS = ("gymnasium.wrappers.common.TimeLimit", "rl_zoo3.gym_patches.PatchedTimeLimit")
 
 
 @runtime_checkable
@@ -415,23 +419,25 @@ def _find_step_sequence(env: gym.Env, observing: bool) -> StepSequence | None:
     if type(env) is Monitor:
         inner = _find_step_sequence(env.env, observing)
         return None if inner is None else _monitored(env, inner)
-    if type(env) is TimeLimit:
+    if isinstance(env, gym.Wrapper) and f"{type(env).__module__}.{type(env).__name__}" in _TIME_LIMITS:
         inner = _find_step_sequence(env.env, observing)
         return None if inner is None else _time_limited(env, inner)
     return find_rollout(env)
 
 
-def _time_limited(env: TimeLimit, play: StepSequence) -> StepSequence:
+def _time_limited(env: gym.Wrapper, play: StepSequence) -> StepSequence:
     """Keep a TimeLimit's count over a sequence of steps that it does not see one by one."""
 
     def step_sequence(actions: np.ndarray, observe: Sequence[int] = ()) -> SequenceResult:
-        elapsed: int = env._elapsed_steps  # type: ignore[assignment]  # reset() has set it
-        actions = actions[: max(1, env._max_episode_steps - elapsed)]
+        limit: Any = env
+        actions = actions[: max(1, limit._max_episode_steps - limit._elapsed_steps)]
         on_the_way = [k for k in observe if k < len(actions)]
         obs, rewards, terminated, truncated, info = play(actions, on_the_way) if on_the_way else play(actions)
-        elapsed += len(rewards)  # type: ignore[arg-type]
-        env._elapsed_steps = elapsed  # type: ignore[assignment]
-        return obs, rewards, terminated, truncated or elapsed >= env._max_episode_steps, info
+        rewards = np.asarray(rewards, dtype=np.float64)
+        limit._elapsed_steps += len(rewards) - 1
+        last_step = (obs, rewards[-1], terminated, truncated, info)
+        obs, _, terminated, truncated, info = _see_last_step(env, actions[len(rewards) - 1], last_step)
+        return obs, rewards, terminated, truncated, info
 
     return step_sequence
 
@@ -444,13 +450,18 @@ def _monitored(monitor: Monitor, play: StepSequence) -> StepSequence:
         rewards = np.asarray(rewards, dtype=np.float64)
         monitor.rewards.extend(rewards[:-1].tolist())
         monitor.total_steps += len(rewards) - 1
-        # Monitor's own step closes the books of the last step, and of the episode if it ended there.
-        env, last_step = monitor.env, (obs, rewards[-1], terminated, truncated, info)
-        monitor.env = SimpleNamespace(step=lambda _: last_step)  # type: ignore[assignment]
-        try:
-            obs, _, terminated, truncated, info = monitor.step(actions[len(rewards) - 1])
-        finally:
-            monitor.env = env
+        last_step = (obs, rewards[-1], terminated, truncated, info)
+        obs, _, terminated, truncated, info = _see_last_step(monitor, actions[len(rewards) - 1], last_step)
         return obs, rewards, terminated, truncated, info
 
     return step_sequence
+
+
+def _see_last_step(wrapper: gym.Wrapper, action: np.ndarray, result: tuple[Any, ...]) -> tuple[Any, ...]:
+    """What a wrapper's own ``step`` makes of a step that was made already."""
+    env = wrapper.env
+    wrapper.env = SimpleNamespace(step=lambda _: result)  # type: ignore[assignment]
+    try:
+        return wrapper.step(action)
+    finally:
+        wrapper.env = env
