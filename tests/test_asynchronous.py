@@ -277,12 +277,14 @@ def test_ctrl_c_stops_both_within_a_second_and_saves(tmp_path, signum):
     script.write_text(
         textwrap.dedent(
             f"""
-            import multiprocessing, sys, time
+            import multiprocessing, signal, sys, time
             sys.path.insert(0, {os.path.dirname(__file__)!r})
             from test_asynchronous import Point, make_model
             from sb3_ctco import CTCO
             from sb3_ctco.realtime import AsynchronousTrainer
             if __name__ == "__main__":
+                # Shells let what they start in the background ignore Ctrl-C, and tests may run there.
+                signal.signal(signal.SIGINT, signal.default_int_handler)
                 env = Point()
                 trainer = AsynchronousTrainer(make_model(CTCO, env), env, {str(tmp_path / "run")!r}, learner_niceness=0)
                 def report(a, b):
