@@ -48,6 +48,7 @@ SETTINGS: dict[str, dict[str, Any]] = {
     # before any reward is found.
     "paper": {
         **COMMON,
+        "n_sub_options": 0,
         "n_rbf": 3,
         "d_max": 0.5,
         "high_freq_penalty": 0.05,

@@ -65,6 +65,7 @@ def make_model(args: argparse.Namespace, env: gym.Env) -> OffPolicyAlgorithm:
             learning_starts=starts,
             buffer_size=args.buffer_size,
             n_rbf=2,
+            n_sub_options=args.n_sub_options,
             d_max=args.d_max,
             high_freq_penalty=0.02,
             **updates,
@@ -258,6 +259,7 @@ def main() -> None:
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--minutes", type=float, default=60.0, help="task time")
     parser.add_argument("--updates-per-second", type=float, default=10.0, help="of task time")
+    parser.add_argument("--n-sub-options", type=int, default=0, help="of CTCO; each takes a row of the replay buffer")
     parser.add_argument("--d-max", type=float, default=1.0, help="longest option of CTCO, s")
     parser.add_argument("--buffer-size", type=int, default=100_000, help="transitions; a full one takes 29 kB each")
     parser.add_argument("--asynchronous", action="store_true", help="act by the wall clock, learn in another process")
