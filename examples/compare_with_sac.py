@@ -52,7 +52,6 @@ def train(name: str, args: argparse.Namespace, seed: int) -> Run:
         "learning_rate": args.learning_rate,
         "learning_starts": args.learning_starts,
         "batch_size": args.batch_size,
-        "buffer_size": args.steps,
         "train_freq": args.train_freq,
         "gradient_steps": args.gradient_steps,
         "policy_kwargs": {"net_arch": args.net_arch},
