@@ -147,7 +147,8 @@ def test_accounting_of_a_training(random_walk_env, kind):
     rows = buffer.pos
     assert len(durations) < rows <= 3 * len(durations)
     if kind == "vector":
-        assert model._n_updates > 20
+        # One update a call, and a call brings at most three options of ten steps: how many there are depends on timing.
+        assert model._n_updates >= (300 - 60) / 30
     env.close()
 
 
