@@ -209,6 +209,18 @@ def test_a_decision_rate_is_kept_from_above_only():
     assert model._current_high_freq_penalty() > falling
 
 
+def test_target_entropies_may_be_schedules(random_walk_env):
+    # 2 at the beginning, −2 in the end
+    model = make(random_walk_env(), target_entropy=lambda remaining: 4 * remaining - 2, duration_target_entropy=-0.5)
+    assert model._target_entropies.tolist() == [2.0, -0.5]
+    model.learn(200)
+    model._current_progress_remaining = 0.25
+    model.train(1, 8)
+    assert model._target_entropies.tolist() == [-1.0, -0.5]
+    with pytest.raises(ValueError, match="target_entropy must be a number, a function of the remaining progress or 'auto'"):
+        make(random_walk_env(), target_entropy="car")
+
+
 def test_the_paper_s_algorithm():
     model = CTCO("MlpPolicy", "Pendulum-v1", **CTCO.paper_defaults(), device="cpu", seed=0, learning_starts=50).learn(100)
     assert model.critic.n_critics == 1
