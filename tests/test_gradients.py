@@ -8,7 +8,7 @@ import pytest
 import torch as th
 
 from sb3_ctco import CTCO
-from sb3_ctco.ctco.gradients import HandGradients, PlainNetwork
+from sb3_ctco.ctco.gradients import HandGradients, PlainNetworks, _layers
 from sb3_ctco.ctco.policies import EnsembleLinear
 
 SMALL = {
@@ -75,14 +75,16 @@ def test_an_update_is_that_of_autograd(kwargs):
 def test_the_network_s_gradients_are_autograd_s():
     th.manual_seed(0)
     layers = th.nn.Sequential(EnsembleLinear(2, 5, 7), th.nn.ReLU(), EnsembleLinear(2, 7, 3))
-    network = PlainNetwork(layers)
+    network = PlainNetworks(_layers(layers), _layers(copy.deepcopy(layers)))
     x = th.randn(11, 5, requires_grad=True)
     outputs = layers(x.expand(2, 11, 5))
     gradient = th.randn(2, 11, 3)
     outputs.backward(gradient)
-    th.testing.assert_close(network.forward(x.detach()), outputs.detach())
+    th.testing.assert_close(network.forward(x.detach().expand(2, 11, 5)), outputs.detach())
     network.backward(gradient)
-    for parameter, value in network.gradients.items():
+    assert set(network.learned) == set(layers.parameters())
+    for parameter, pieces in network.learned.items():
+        ((_, _, value),) = pieces
         th.testing.assert_close(value, parameter.grad)
     th.testing.assert_close(network.input_gradient(gradient), x.grad)
     th.testing.assert_close(network.input_gradient(gradient, first=2), x.grad[:, 2:])

@@ -325,19 +325,21 @@ class CTCO(SoftOptionActorCritic):
         if self.target_decision_rate is not None:
             self._update_high_freq_penalty()
         self._prepare_hand_gradients()
-        super().train(gradient_steps, batch_size)
-        if self._hand_gradients is not None:
-            self._hand_gradients.write_back()
+        try:
+            super().train(gradient_steps, batch_size)
+        finally:  # also what was learned until somebody pressed Ctrl-C
+            if self._hand_gradients is not None:
+                self._hand_gradients.store()
         self.logger.record("option/high_freq_penalty", self._current_high_freq_penalty())
 
     def _prepare_hand_gradients(self) -> None:
         # Not possible before the first update, with which optimizers get their state.
         if not (self._has_own_losses() and HandGradients.possible_for(self)):
             self._hand_gradients = None
-        elif self._hand_gradients is None or not self._hand_gradients.is_valid():
+            return
+        if self._hand_gradients is None or not self._hand_gradients.is_valid():
             self._hand_gradients = HandGradients(self)
-        else:
-            self._hand_gradients.refresh()
+        self._hand_gradients.load()
 
     def _has_own_losses(self) -> bool:
         """Whether no subclass changed what the gradients were worked out for."""

@@ -8,7 +8,7 @@ losses are a few lines, and so are their gradients: :class:`HandGradients` does,
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from typing import TYPE_CHECKING, Any
 
 import torch as th
@@ -17,7 +17,7 @@ from stable_baselines3.common.type_aliases import ReplayBufferSamples
 from torch import nn
 from torch.nn import functional as F
 
-from sb3_ctco.common.policies import LOG_STD_MAX, LOG_STD_MIN, EnsembleLinear
+from sb3_ctco.common.policies import LOG_STD_MAX, LOG_STD_MIN, EnsembleLinear, affine
 from sb3_ctco.common.soft_actor_critic import critic_loss
 from sb3_ctco.ctco.policies import OptionActor, OptionCritic
 
@@ -26,21 +26,23 @@ if TYPE_CHECKING:
 
 aten = th.ops.aten
 
+#: A layer, and which of its outputs. A list of such is a layer that has these outputs side by side.
+Part = tuple[nn.Module, slice]
+
 
 class HandGradients:
-    """One update of a :class:`~sb3_ctco.ctco.ctco.CTCO` at a time, without autograd.
+    """Updates of a :class:`~sb3_ctco.ctco.ctco.CTCO` without autograd, on copies of its networks' parameters.
+
+    :meth:`load` takes the copies and :meth:`store` writes them back: around every training.
 
     :param model: whose networks it updates; :meth:`possible_for` it must be true
     """
 
     def __init__(self, model: CTCO):
         self._model = model
-        self._actor = _PlainActor(model.actor)
-        self._actor_target = _PlainActor(model.actor_target)
-        self._critic = PlainNetwork(model.critic.q_networks)
-        self._critic_target = PlainNetwork(model.critic_target.q_networks)
+        self._actors = _PlainActors(model.actor, model.actor_target)
+        self._critics = PlainNetworks(_layers(model.critic.q_networks), _layers(model.critic_target.q_networks))
         self._memory = _memory(model.policy.parameters())
-        self.refresh()
 
     @staticmethod
     def possible_for(model: CTCO) -> bool:
@@ -63,15 +65,26 @@ class HandGradients:
         """Whether the networks' parameters are still where they were, as they are not after ``policy.to(device)``."""
         return self._memory == _memory(self._model.policy.parameters())
 
-    def refresh(self) -> None:
-        """Take step sizes and moments from the optimizers anew, which loading replaces."""
+    def load(self) -> None:
+        """Take parameters from the networks, step sizes and moments from the optimizers."""
         model = self._model
-        self._actor_adam = _Adam(model.actor.optimizer, self._actor.gradients)
-        self._critic_adam = _Adam(model.critic.optimizer, self._critic.gradients)
+        for networks in (self._actors.networks, self._critics):
+            th._foreach_copy_(networks.copies, networks.originals)
+        self._actor_adam = _Adam(model.actor.optimizer, self._actors.networks.learned)
+        self._critic_adam = _Adam(model.critic.optimizer, self._critics.learned)
         self._ent_coef_gradient = th.zeros_like(model.log_ent_coefs)
         self._ent_coef_adam: _Adam | None = None
         if model.ent_coef_optimizer is not None:
-            self._ent_coef_adam = _Adam(model.ent_coef_optimizer, {model.log_ent_coefs: self._ent_coef_gradient})
+            learned = {model.log_ent_coefs: [(slice(None), model.log_ent_coefs.detach()[None], self._ent_coef_gradient[None])]}
+            self._ent_coef_adam = _Adam(model.ent_coef_optimizer, learned)
+
+    def store(self) -> None:
+        """Write parameters to the networks, and to the optimizers how many steps they took."""
+        with th.no_grad():
+            for networks in (self._actors.networks, self._critics):
+                th._foreach_copy_(networks.originals, networks.copies)
+        for adam in filter(None, (self._actor_adam, self._critic_adam, self._ent_coef_adam)):
+            adam.store()
 
     @th.inference_mode()
     def update(self, data: ReplayBufferSamples) -> th.Tensor:
@@ -79,132 +92,180 @@ class HandGradients:
 
         :return: the losses of actor, critics and temperatures, ``[3]``
         """
-        model = self._model
-        obs, next_obs = self._features(data.observations), self._features(data.next_observations)
+        model, n_critics = self._model, self._critics.n_learned
+        features = th.stack([self._features(obs) for obs in (data.observations, data.next_observations)])
+        batch_size = features.shape[1]
 
-        options, log_prob = self._actor.sample(obs)
-        gradient, ent_coef_loss = model._temperature_gradient(log_prob)
+        # Of the actor in the observations, and of its target in the next.
+        options, log_prob = self._actors.sample(features)
+        gradient, ent_coef_loss = model._temperature_gradient(log_prob[0])
         if self._ent_coef_adam is not None:
             self._ent_coef_gradient.copy_(gradient)
             self._ent_coef_adam.step()
 
-        next_options, next_log_prob = self._actor_target.sample(next_obs)
-        next_q_values = self._critic_target.forward(th.cat((next_obs, next_options), dim=1))
-        targets = model._targets(data, next_q_values, model.entropy_costs(next_options, next_log_prob))
-        q_values = self._critic.forward(th.cat((obs, data.actions), dim=1))
-        self._critic.backward((q_values - targets) / len(obs))
+        inputs = th.cat((features, th.stack((data.actions, options[1]))), dim=2)
+        # Of the critics, and of their targets.
+        q_values, next_q_values = self._critics.forward(
+            inputs[:, None].expand(-1, n_critics, -1, -1).flatten(end_dim=1)
+        ).split(n_critics)
+        targets = model._targets(data, next_q_values, model.entropy_costs(options[1], log_prob[1]))
+        self._critics.backward((q_values - targets) / batch_size)
         self._critic_adam.step()
         q_loss = critic_loss(q_values, targets)
 
-        q_values = self._critic.forward(th.cat((obs, options), dim=1))
+        inputs = th.cat((features[0], options[0]), dim=1)
+        q_values = self._critics.forward(inputs.expand(n_critics, -1, -1))
         q_min = q_values.amin(dim=0)
-        pi_loss = (model.entropy_costs(options, log_prob) - q_min).mean()
-        option_gradient = self._critic.input_gradient((q_values == q_min) / -len(obs), first=obs.shape[1])
-        self._actor.backward(option_gradient, model.ent_coefs / len(obs))
+        pi_loss = (model.entropy_costs(options[0], log_prob[0]) - q_min).mean()
+        option_gradient = self._critics.input_gradient((q_values == q_min) / -batch_size, first=features.shape[2])
+        self._actors.backward(option_gradient, model.ent_coefs / batch_size)
         self._actor_adam.step()
 
-        model._update_targets()
+        self._critics.update_targets(model.tau)
+        self._actors.networks.update_targets(model.tau)
         return th.stack((pi_loss, q_loss, ent_coef_loss))
-
-    def write_back(self) -> None:
-        """Write to the optimizers how many steps they took."""
-        for adam in filter(None, (self._actor_adam, self._critic_adam, self._ent_coef_adam)):
-            adam.write_back()
 
     def _features(self, obs: th.Tensor) -> th.Tensor:
         return self._model.actor.extract_features(obs, self._model.actor.features_extractor)
 
 
-class PlainNetwork:
-    """An ensemble of networks of linear layers with rectifiers between them, and the gradients of its parameters.
+class PlainNetworks:
+    """An ensemble of networks of linear layers with rectifiers between them, and its targets, side by side.
 
-    :param layers: ``nn.Linear`` (an ensemble of one) or ``EnsembleLinear``, each but perhaps the last followed by a
-        ``nn.ReLU``
+    It works on copies of their parameters, and has the gradients of the ensemble's.
+
+    :param learned: layers of the ensemble: ``EnsembleLinear``, or ``nn.Linear`` for an ensemble of one
+    :param targets: layers of its targets
     """
 
-    def __init__(self, layers: Iterable[nn.Module]):
-        modules = list(layers)
-        linear: list[Any] = [module for module in modules if not isinstance(module, nn.ReLU)]
-        #: Gradients, which :meth:`backward` writes, by their parameters.
-        self.gradients: dict[nn.Parameter, th.Tensor] = {p: th.zeros_like(p) for layer in linear for p in layer.parameters()}
-        # Views: an optimizer's steps show in them, and what is written to them in the gradients.
-        self._weights = [_as_ensemble(layer.weight.detach()) for layer in linear]
-        self._biases = [_as_ensemble(layer.bias.detach()) for layer in linear]
-        self._weight_gradients = [_as_ensemble(self.gradients[layer.weight]) for layer in linear]
-        self._bias_gradients = [_as_ensemble(self.gradients[layer.bias]) for layer in linear]
-        self._n_rectified = sum(isinstance(module, nn.ReLU) for module in modules)
+    def __init__(self, learned: Sequence[Sequence[Part]], targets: Sequence[Sequence[Part]]):
+        #: Parameters, as views, and their copies here.
+        self.originals: list[th.Tensor] = []
+        self.copies: list[th.Tensor] = []
+        #: Of each parameter of the ensemble: rows, and their copy and gradient here.
+        self.learned: dict[nn.Parameter, list[tuple[slice, th.Tensor, th.Tensor]]] = {}
+        self._stacks: list[th.Tensor] = []
+        weights, biases = (
+            [self._stack(parts, name) for parts in zip(learned, targets, strict=True)] for name in ("weight", "bias")
+        )
+        #: How many members the ensemble has; :meth:`forward` evaluates these alone, or those of the targets as well.
+        self.n_learned = len(weights[0][1])
+        self._weights = {n: [weight[:n] for weight, _ in weights] for n in (self.n_learned, len(weights[0][0]))}
+        self._biases = {n: [bias[:n] for bias, _ in biases] for n in self._weights}
+        self._gradients = [(weight, bias) for (_, weight), (_, bias) in zip(weights, biases, strict=True)]
+        self._learned_stacks = [stack[: self.n_learned] for stack in self._stacks]
+        self._target_stacks = [stack[self.n_learned :] for stack in self._stacks]
         self._activations: list[th.Tensor] = []
 
+    def _stack(self, ensembles: Sequence[Sequence[Part]], name: str) -> tuple[th.Tensor, th.Tensor]:
+        """Copies of weights or biases of a layer of all members, and what will be the gradient of the learned.
+
+        :return: ``[n_members, in_features, out_features]``, or ``[n_members, 1, out_features]``
+        """
+        views = [[_rows(getattr(module, name).detach(), rows) for module, rows in parts] for parts in ensembles]
+        stack = th.cat([th.cat(parts, dim=1) for parts in views])
+        gradient = th.zeros_like(stack[: len(views[0][0])])
+        first_member = 0
+        for parts, part_views in zip(ensembles, views, strict=True):
+            members, first_row = slice(first_member, first_member + len(part_views[0])), 0
+            for (module, rows), view in zip(parts, part_views, strict=True):
+                part = (members, slice(first_row, first_row + view.shape[1]))
+                self.originals.append(view)
+                self.copies.append(stack[part])
+                if first_member == 0:
+                    self.learned.setdefault(getattr(module, name), []).append((rows, stack[part], gradient[part]))
+                first_row += view.shape[1]
+            first_member += len(part_views[0])
+        self._stacks.append(stack)
+        if isinstance(ensembles[0][0][0], nn.Linear):
+            return (stack.mT, gradient.mT) if name == "weight" else (stack[:, None], gradient[:, None])
+        return stack, gradient
+
     def forward(self, x: th.Tensor) -> th.Tensor:
-        """Outputs ``[n_members, batch, out_features]`` of inputs ``[batch, in_features]``, which are remembered."""
-        x = x.expand(len(self._weights[0]), *x.shape)
+        """Outputs ``[n_members, batch, out_features]`` of inputs ``[n_members, batch, in_features]``, which are remembered."""
+        weights, biases = self._weights[len(x)], self._biases[len(x)]
         self._activations = [x]
-        for i, (weight, bias) in enumerate(zip(self._weights, self._biases, strict=True)):
-            x = th.baddbmm(bias, x, weight)
-            if i < self._n_rectified:
-                x.relu_()
+        for i, (weight, bias) in enumerate(zip(weights, biases, strict=True)):
+            x = affine(x if i == 0 else x.relu_(), weight, bias)
             self._activations.append(x)
         return x
 
     def backward(self, gradient: th.Tensor) -> None:
-        """Compute :attr:`gradients` from the gradient of the last outputs, of their shape."""
-        for i in reversed(range(len(self._weights))):
-            gradient = self._before_rectifier(gradient, i)
-            th.bmm(self._activations[i].transpose(1, 2), gradient, out=self._weight_gradients[i])
-            th.sum(gradient, 1, keepdim=True, out=self._bias_gradients[i])
+        """Compute the gradients of the ensemble's parameters.
+
+        :param gradient: of its last outputs, ``[n_learned, batch, out_features]``
+        """
+        for i in reversed(range(len(self._gradients))):
+            weight_gradient, bias_gradient = self._gradients[i]
+            activations = self._activations[i][: self.n_learned]
+            if gradient.shape[2] == 1:
+                th.bmm(gradient.mT, activations, out=weight_gradient.mT)  # BLAS is slow the other way, see affine
+            else:
+                th.bmm(activations.mT, gradient, out=weight_gradient)
+            th.sum(gradient, 1, keepdim=True, out=bias_gradient)
             if i > 0:
-                gradient = th.bmm(gradient, self._weights[i].transpose(1, 2))
+                gradient = self._before_layer(gradient, i)
 
     def input_gradient(self, gradient: th.Tensor, first: int = 0) -> th.Tensor:
-        """The gradient of the last inputs from that of the outputs; :attr:`gradients` stay.
+        """The gradient of the ensemble's last inputs, summed over its members.
 
-        :param gradient: of the shape of the outputs
+        :param gradient: of its last outputs, ``[n_learned, batch, out_features]``
         :param first: from which column of the inputs on
-        :return: ``[batch, in_features − first]``, summed over the ensemble
+        :return: ``[batch, in_features − first]``
         """
-        for i in reversed(range(len(self._weights))):
-            weight = self._weights[i] if i > 0 else self._weights[i][:, first:]
-            gradient = th.bmm(self._before_rectifier(gradient, i), weight.transpose(1, 2))
-        return gradient.sum(dim=0)
+        for i in reversed(range(1, len(self._gradients))):
+            gradient = self._before_layer(gradient, i)
+        return _times_transposed(gradient, self._weights[self.n_learned][0][:, first:]).sum(dim=0)
 
-    def _before_rectifier(self, gradient: th.Tensor, i: int) -> th.Tensor:
-        if i >= self._n_rectified:
-            return gradient
-        return aten.threshold_backward(gradient, self._activations[i + 1], 0.0)
+    def _before_layer(self, gradient: th.Tensor, i: int) -> th.Tensor:
+        """The gradient of what the rectifier before layer ``i`` was given, from that of the layer's outputs."""
+        gradient = _times_transposed(gradient, self._weights[self.n_learned][i])
+        return aten.threshold_backward(gradient, self._activations[i][: self.n_learned], 0.0)
+
+    def update_targets(self, tau: float) -> None:
+        """Stable-Baselines3's ``polyak_update``."""
+        th._foreach_lerp_(self._target_stacks, self._learned_stacks, tau)
 
 
-class _PlainActor:
-    """The actor of :class:`~sb3_ctco.ctco.policies.OptionActor`, its samples, and the gradients of its parameters."""
+class _PlainActors:
+    """The actor of :class:`~sb3_ctco.ctco.policies.OptionActor` and its target: samples, and the actor's gradients."""
 
-    def __init__(self, actor: OptionActor):
-        self._body = PlainNetwork(actor.latent_pi)
-        self._heads = [PlainNetwork([actor.omega_head]), PlainNetwork([actor.duration_head])]
-        self.gradients = {p: g for network in (self._body, *self._heads) for p, g in network.gradients.items()}
+    def __init__(self, actor: OptionActor, target: OptionActor):
+        self._n = n = actor.omega_dim
+
+        def layers(actor: OptionActor) -> list[list[Part]]:
+            omega, duration = actor.omega_head, actor.duration_head
+            means, log_stds = [(omega, slice(n)), (duration, slice(1))], [(omega, slice(n, None)), (duration, slice(1, None))]
+            return [*_layers(actor.latent_pi), [*means, *log_stds]]
+
+        self.networks = PlainNetworks(layers(actor), layers(target))
         self._scale = actor.squash_scale
-        self._omega_dim = actor.omega_dim
         # Sums the columns of ω in its first column, and has those of d in its second.
-        self._parts = th.zeros(self._omega_dim + 1, 2, device=self._scale.device)
+        self._parts = th.zeros(n + 1, 2, device=self._scale.device)
         self._parts[:-1, 0] = self._parts[-1, 1] = 1.0
         self._constants = (-self._scale.log() - 0.5 * math.log(2 * math.pi) - 2.0 * math.log(2.0)) @ self._parts
 
     def sample(self, obs: th.Tensor) -> tuple[th.Tensor, th.Tensor]:
-        """``OptionActor.option_log_prob``: options and log π of their parts."""
-        latent = self._body.forward(obs)[0]
-        omega, duration = (head.forward(latent)[0] for head in self._heads)
-        n = self._omega_dim
-        mean = th.cat((omega[:, :n], duration[:, :1]), dim=1)
-        self._raw_log_std = th.cat((omega[:, n:], duration[:, 1:]), dim=1)
-        log_std = self._raw_log_std.clamp(LOG_STD_MIN, LOG_STD_MAX)
-        noise = th.randn_like(mean)
-        self._deviation = noise * log_std.exp()
-        y = (mean + self._deviation) * self._scale
-        self._options = y.tanh()
+        """``OptionActor.option_log_prob``: options, and log π of their parts, of both actors.
+
+        :param obs: ``[2, batch, features]``
+        :return: ``[2, batch, omega_dim + 1]`` and ``[2, batch, 2]``
+        """
+        mean, raw_log_std = self.networks.forward(obs).split(self._n + 1, dim=2)
+        log_std = raw_log_std.clamp(LOG_STD_MIN, LOG_STD_MAX)
+        noise = th.empty_like(log_std)
+        for one in noise:  # as randn_like would draw it for one actor after the other
+            one.normal_()
+        deviation = noise * log_std.exp()
+        y = (mean + deviation) * self._scale
+        options = y.tanh()
         # squashed_log_prob in fewer operations: its constants are added in the end
         log_prob = F.softplus(-2.0 * y).add_(y).mul_(2.0).sub_(th.addcmul(log_std, noise, noise, value=0.5))
-        return self._options, th.addmm(self._constants, log_prob, self._parts)
+        self._options, self._deviation, self._raw_log_std = options[0], deviation[0], raw_log_std[0]
+        return options, (log_prob @ self._parts).add_(self._constants)
 
     def backward(self, option_gradient: th.Tensor, log_prob_gradient: th.Tensor) -> None:
-        """Compute :attr:`gradients` from those of the last sample.
+        """Compute the gradients of the actor's parameters from those of its last sample.
 
         :param option_gradient: of the options, ``[batch, omega_dim + 1]``
         :param log_prob_gradient: of log π of both parts, the same for the whole batch, ``[2]``
@@ -216,24 +277,17 @@ class _PlainActor:
         log_std_gradient = aten.hardtanh_backward(
             mean_gradient * self._deviation - log_prob_gradient, self._raw_log_std, LOG_STD_MIN, LOG_STD_MAX
         )
-        n = self._omega_dim
-        parts = (mean_gradient[:, :n], log_std_gradient[:, :n]), (mean_gradient[:, n:], log_std_gradient[:, n:])
-        latent_gradient = th.zeros(())
-        for head, part in zip(self._heads, parts, strict=True):
-            gradient = th.cat(part, dim=1)[None]
-            head.backward(gradient)
-            latent_gradient = latent_gradient + head.input_gradient(gradient)
-        self._body.backward(latent_gradient[None])
+        self.networks.backward(th.cat((mean_gradient, log_std_gradient), dim=1)[None])
 
 
 class _Adam:
-    """PyTorch's fused Adam on an optimizer's own state, without what its ``step`` does beside.
+    """PyTorch's fused Adam on an optimizer's own moments, without what its ``step`` does beside.
 
     :param optimizer: that has stepped, so that it has a state
-    :param gradients: of its parameters
+    :param learned: of each of its parameters, rows, their values and their gradients, see :class:`PlainNetworks`
     """
 
-    def __init__(self, optimizer: th.optim.Optimizer, gradients: dict[Any, th.Tensor]):
+    def __init__(self, optimizer: th.optim.Optimizer, learned: dict[Any, list[tuple[slice, th.Tensor, th.Tensor]]]):
         self._groups: list[tuple[tuple[list[th.Tensor], ...], dict[str, Any]]] = []
         self._counters: list[tuple[th.Tensor, list[th.Tensor]]] = []
         for group in optimizer.param_groups:
@@ -241,14 +295,12 @@ class _Adam:
             # Parameters of a group have taken the same number of steps. One counter serves all until the end.
             count = states[0]["step"].clone()
             self._counters.append((count, [state["step"] for state in states]))
-            tensors: tuple[list[th.Tensor], ...] = (
-                [p.detach() for p in group["params"]],
-                [gradients[p] for p in group["params"]],
-                [state["exp_avg"] for state in states],
-                [state["exp_avg_sq"] for state in states],
-                [],
-                [count] * len(states),
-            )
+            pieces = [
+                (value, gradient, _rows(state["exp_avg"], rows), _rows(state["exp_avg_sq"], rows))
+                for p, state in zip(group["params"], states, strict=True)
+                for rows, value, gradient in learned[p]
+            ]
+            tensors = (*(list(column) for column in zip(*pieces, strict=True)), [], [count] * len(pieces))
             options = {
                 "lr": group["lr"],
                 "beta1": group["betas"][0],
@@ -265,17 +317,23 @@ class _Adam:
             count.add_(1.0)
             th._fused_adam_(*tensors, **options)
 
-    def write_back(self) -> None:
+    def store(self) -> None:
         for count, steps in self._counters:
             for step in steps:
                 step.copy_(count)
 
 
-def _as_ensemble(parameter: th.Tensor) -> th.Tensor:
-    """Weights as ``[n_members, in_features, out_features]``, biases as ``[n_members, 1, out_features]``."""
-    if parameter.dim() == 3:
-        return parameter
-    return parameter.t()[None] if parameter.dim() == 2 else parameter[None, None]
+def _layers(network: nn.Sequential) -> list[list[Part]]:
+    return [[(module, slice(None))] for module in network if not isinstance(module, nn.ReLU)]
+
+
+def _rows(parameter: th.Tensor, rows: slice) -> th.Tensor:
+    """Rows of a parameter of ``nn.Linear`` as of an ensemble of one; ``EnsembleLinear`` has its own as they are."""
+    return parameter if parameter.dim() == 3 else parameter[rows][None]
+
+
+def _times_transposed(gradient: th.Tensor, weight: th.Tensor) -> th.Tensor:
+    return gradient * weight.mT if weight.shape[2] == 1 else th.bmm(gradient, weight.mT)
 
 
 def _is_plain(network: nn.Sequential, linear: type[nn.Module]) -> bool:
