@@ -168,7 +168,7 @@ class ActionBox:
     def __init__(self, low: npt.NDArray[Any], high: npt.NDArray[Any]):
         self.low, self.high = low, high
         self._bottom = low.astype(np.float64).ravel()
-        self._width = high.astype(np.float64).ravel() - self._bottom
+        self._half_width = 0.5 * (high.astype(np.float64).ravel() - self._bottom)
 
     def actions(self, trajectory: FloatArray) -> npt.NDArray[Any]:
         """Normalised actions in the units of the box.
@@ -176,7 +176,7 @@ class ActionBox:
         :param trajectory: actions in [−1, 1], shape ``[n_steps, action_dim]``
         :return: shape ``[n_steps, *action_shape]``, in the precision of ``low``
         """
-        actions = self._bottom + (0.5 * (trajectory + 1.0)) * self._width
+        actions = (trajectory + 1.0) * self._half_width + self._bottom
         # The cast to the box's precision may round past a bound.
         return actions.astype(self.low.dtype).reshape(-1, *self.low.shape).clip(self.low, self.high)
 
