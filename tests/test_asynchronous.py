@@ -313,8 +313,7 @@ def test_ctrl_c_stops_both_within_a_second_and_saves(tmp_path, signum):
     name, command, when = rest.strip().splitlines()[-1].split()
     assert name == {signal.SIGINT: "KeyboardInterrupt", signal.SIGTERM: "SystemExit"}[signum]
     assert float(command) == 0.0
-    # Generous, for machines that are busy with something else.
-    assert float(when) - sent < 5.0
+    assert float(when) - sent < 1.0
     saved = CTCO.load(tmp_path / "run" / "model.zip")
     assert saved._n_updates > 0
     assert len(records_of(tmp_path / "run")) > 1

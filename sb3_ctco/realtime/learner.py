@@ -3,6 +3,7 @@
 import multiprocessing
 import os
 import signal
+import sys
 import time
 import traceback
 from dataclasses import dataclass
@@ -87,16 +88,21 @@ def run_learner(settings: LearnerSettings, weights: SharedWeights, stop: Event, 
     except Exception:
         report.send(("failed", traceback.format_exc()))
         raise SystemExit(1) from None
+    exit_code = 0
     try:
         report.send(("ready", None))
         learner.run()
     except (BrokenPipeError, ConnectionResetError):
         pass  # the acting process is gone
     except Exception:
+        exit_code = 1
         report.send(("failed", traceback.format_exc()))
-        raise SystemExit(1) from None
     finally:
         learner.save()
+    # Everything is on disk. The interpreter would take another second to clear its memory, and the acting process waits.
+    sys.stdout.flush()
+    sys.stderr.flush()
+    os._exit(exit_code)
 
 
 class _Learner:
