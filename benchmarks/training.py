@@ -50,7 +50,7 @@ def make(name: str, rate: int) -> BaseAlgorithm:
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--seconds", type=float, default=20.0, help="task time of a repeat")
-    parser.add_argument("--repeats", type=int, default=7)
+    parser.add_argument("--repeats", type=int, default=3)
     args = parser.parse_args()
     th.set_num_threads(1)
     print("| | SAC [s/s] | CTCO [s/s] | ratio | CTCO without sub-options [s/s] | ratio |\n|---|---|---|---|---|---|")
