@@ -148,14 +148,15 @@ class _Execution:
     """An option in execution, or none yet (``n_steps`` of 0).
 
     :param plan: its actions, if ticks come at a fixed rate
+    :param weights: ω in the units of the actions, ``[n_rbf, action_dim]``, if they come by a clock
     :param tick: how many of its ticks have passed
     :param start: when it began, by the caller's clock, in s
     """
 
     option: np.ndarray
-    omega: np.ndarray
     n_steps: int
     plan: np.ndarray
+    weights: np.ndarray
     tick: int = 0
     start: float = 0.0
 
@@ -270,9 +271,11 @@ class OptionController:
         self._now = now
         # A late tick may find the phase past its end, where the option holds its last action.
         phases = np.array([min((now - e.start) / (e.n_steps * dt), 1.0) for e in self._executions])
-        omega = np.array([e.omega for e in self._executions])
-        trajectory = (omega @ basis(phases, self.settings.n_rbf)[:, :, None])[:, :, 0]
-        actions = self._box.actions(trajectory)
+        features = basis(phases, self.settings.n_rbf)
+        low, high = self._box.low, self._box.high
+        actions = np.array([row.dot(e.weights) for row, e in zip(features, self._executions, strict=True)])
+        # Rounding may lead past a bound.
+        actions = actions.astype(low.dtype).reshape(-1, *low.shape).clip(low, high)
         return actions if self._several else actions[0]
 
     def _decide(self, observation: Observation, due: list[int], now: float) -> None:
@@ -294,7 +297,9 @@ class OptionController:
         option = np.clip(option.astype(np.float64), -1.0, 1.0)
         omega, n_steps = self.settings.decode(option)
         plan = self._box.actions(action_plan(omega, n_steps))
-        return _Execution(option, omega, n_steps, plan, start=now)
+        # Features sum to one, so that actions are the same combination of weights in their own units.
+        weights = self._box.actions(omega.T).reshape(len(omega.T), -1).astype(np.float64)
+        return _Execution(option, n_steps, plan, weights, start=now)
 
     @property
     def option(self) -> np.ndarray:

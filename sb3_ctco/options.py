@@ -90,7 +90,7 @@ def basis(phase: FloatArray, n_rbf: int) -> FloatArray:
     centres, variance = _centres_and_variance(n_rbf)
     distance = np.asarray(phase)[:, None] - centres
     activation = np.exp(distance * distance / (-2.0 * variance))
-    return activation / activation.sum(axis=1, keepdims=True)
+    return activation / np.add.reduce(activation, axis=1, keepdims=True)
 
 
 @lru_cache(maxsize=64)
