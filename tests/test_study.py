@@ -454,6 +454,7 @@ def test_the_table_stands_beside_the_papers_numbers():
     assert any(line.startswith("| training | CTCO | tuned | ") and "[" in line for line in lines)
     assert lines[0].startswith("Preset quick (2400 s of task time); 2 seeds; commit abc1234.")
     assert "| cheetah run | SAC | large | 1 | 0.97 | 0.05 | -0.04 | -0.03 |" in plots.table(synthetic(1), {})
+    assert "; 1 to 2 seeds; " in plots.table(synthetic()[1:], {})
 
 
 @pytest.mark.usefixtures("few_resamples")

@@ -2,7 +2,7 @@
 
 import csv
 import math
-from collections import defaultdict
+from collections import Counter, defaultdict
 from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -274,8 +274,10 @@ def _rate(record: Record) -> int:
 
 
 def _seeds(records: Sequence[Record]) -> str:
-    n = len({record["seed"] for record in records})
-    return f"{n} seed{'s' * (n > 1)}"
+    """How many seeds there are of a task, algorithm, setting and rate, in words."""
+    counts = Counter((r["task"], r["algorithm"], r["setting"], r["dt"]) for r in records).values()
+    fewest, most = min(counts), max(counts)
+    return f"{most} seed{'s' * (most > 1)}" if fewest == most else f"{fewest} to {most} seeds"
 
 
 def _read_curve(file: Path) -> tuple[np.ndarray, np.ndarray] | None:
