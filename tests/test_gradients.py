@@ -95,6 +95,11 @@ class OtherLoss(CTCO):
         return 2.0 * super()._actor_loss(obs, sample)
 
 
+class OtherTargets(CTCO):
+    def _update_targets(self):
+        """Targets that stay where they are."""
+
+
 @pytest.mark.parametrize(
     "make_model",
     [
@@ -103,6 +108,7 @@ class OtherLoss(CTCO):
         lambda: make(policy_kwargs={"net_arch": [8], "optimizer_kwargs": {"amsgrad": True}}),
         lambda: make(policy_kwargs={"net_arch": [8], "optimizer_class": th.optim.SGD}),
         lambda: OtherLoss("MlpPolicy", "Pendulum-v1", **SMALL),
+        lambda: OtherTargets("MlpPolicy", "Pendulum-v1", **SMALL),
     ],
 )
 def test_what_it_does_not_know_is_left_to_autograd(make_model):

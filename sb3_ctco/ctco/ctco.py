@@ -343,7 +343,15 @@ class CTCO(SoftOptionActorCritic):
 
     def _has_own_losses(self) -> bool:
         """Whether no subclass changed what the gradients were worked out for."""
-        names = ("_sample_policy", "_critic_targets", "_q_values", "_actor_loss", "_update_temperatures", "entropy_costs")
+        names = (
+            "_sample_policy",
+            "_critic_targets",
+            "_q_values",
+            "_actor_loss",
+            "_update_temperatures",
+            "_update_targets",
+            "entropy_costs",
+        )
         return all(getattr(type(self), name) is getattr(CTCO, name) for name in names)
 
     def _update(self, data: ReplayBufferSamples) -> th.Tensor:
