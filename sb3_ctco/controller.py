@@ -272,10 +272,7 @@ class OptionController:
         # A late tick may find the phase past its end, where the option holds its last action.
         phases = np.array([min((now - e.start) / (e.n_steps * dt), 1.0) for e in self._executions])
         features = basis(phases, self.settings.n_rbf)
-        low, high = self._box.low, self._box.high
-        actions = np.array([row.dot(e.weights) for row, e in zip(features, self._executions, strict=True)])
-        # Rounding may lead past a bound.
-        actions = actions.astype(low.dtype).reshape(-1, *low.shape).clip(low, high)
+        actions = self._box.cast(np.array([row.dot(e.weights) for row, e in zip(features, self._executions, strict=True)]))
         return actions if self._several else actions[0]
 
     def _decide(self, observation: Observation, due: list[int], now: float) -> None:
@@ -298,8 +295,7 @@ class OptionController:
         omega, n_steps = self.settings.decode(option)
         plan = self._box.actions(action_plan(omega, n_steps))
         # Features sum to one, so that actions are the same combination of weights in their own units.
-        weights = self._box.actions(omega.T).reshape(len(omega.T), -1).astype(np.float64)
-        return _Execution(option, n_steps, plan, weights, start=now)
+        return _Execution(option, n_steps, plan, self._box.scale(omega.T), start=now)
 
     @property
     def option(self) -> np.ndarray:

@@ -90,7 +90,7 @@ def basis(phase: FloatArray, n_rbf: int) -> FloatArray:
     centres, variance = _centres_and_variance(n_rbf)
     distance = np.asarray(phase)[:, None] - centres
     activation = np.exp(distance * distance / (-2.0 * variance))
-    return activation / np.add.reduce(activation, axis=1, keepdims=True)
+    return activation / activation.sum(axis=1, keepdims=True)
 
 
 @lru_cache(maxsize=64)
@@ -176,8 +176,15 @@ class ActionBox:
         :param trajectory: actions in [−1, 1], shape ``[n_steps, action_dim]``
         :return: shape ``[n_steps, *action_shape]``, in the precision of ``low``
         """
-        actions = (trajectory + 1.0) * self._half_width + self._bottom
-        # The cast to the box's precision may round past a bound.
+        return self.cast(self.scale(trajectory))
+
+    def scale(self, trajectory: FloatArray) -> FloatArray:
+        """Normalised actions in the units of the box, in double precision: shape ``[n_steps, action_dim]``, as given."""
+        return (trajectory + 1.0) * self._half_width + self._bottom
+
+    def cast(self, actions: FloatArray) -> npt.NDArray[Any]:
+        """Actions in the units of the box, in its shape and precision: ``[n_steps, *action_shape]``."""
+        # The cast may round past a bound.
         return actions.astype(self.low.dtype).reshape(-1, *self.low.shape).clip(self.low, self.high)
 
 
