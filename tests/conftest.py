@@ -105,3 +105,16 @@ def scripted_env() -> type[ScriptedEnv]:
 @pytest.fixture
 def random_walk_env() -> type[RandomWalkEnv]:
     return RandomWalkEnv
+
+
+@pytest.fixture(scope="session")
+def opengl() -> None:
+    """Skip a test where pictures cannot be made, but not with REQUIRE_OPENGL, where that is a failure."""
+    from sb3_ctco.envs.visual_reacher import VisualReacherEnv
+
+    try:
+        VisualReacherEnv().close()
+    except RuntimeError as error:  # it says what to install
+        if "REQUIRE_OPENGL" in os.environ:
+            raise
+        pytest.skip(str(error))

@@ -16,10 +16,7 @@ from sb3_ctco.envs.visual_reacher.env import BAG_AREA, JOINT_MARGIN, START_POSE,
 from sb3_ctco.envs.visual_reacher.model import JOINT_LIMITS
 from sb3_ctco.wrappers import OptionExecutionWrapper, SupportsStepSequence, find_dt
 
-try:
-    VisualReacherEnv().close()
-except RuntimeError as error:  # it says what to install
-    pytest.skip(str(error), allow_module_level=True)
+pytestmark = pytest.mark.usefixtures("opengl")
 
 
 @pytest.fixture
