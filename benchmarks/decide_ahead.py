@@ -7,6 +7,7 @@ then played greedily with each of these times. Without sub-options, which are no
 """
 
 import argparse
+import math
 from concurrent.futures import ProcessPoolExecutor
 from typing import Any
 
@@ -14,10 +15,9 @@ import gymnasium as gym
 import numpy as np
 import torch as th
 
-import sb3_ctco  # noqa: F401 (registers the environment)
 from sb3_ctco import CTCO
 from sb3_ctco.common.evaluation import DiscountedReturnCallback, evaluate_discounted_return
-from sb3_ctco.wrappers.real_time_options import RealTimeOptionWrapper
+from sb3_ctco.wrappers import RealTimeOptionWrapper
 
 ENV = "sb3_ctco/ball_in_cup-catch-50hz-v0"
 DT = 0.02
@@ -47,7 +47,7 @@ def measure(ahead: float, seed: int, seconds: float, episodes: int) -> list[floa
         device="cpu",
         **OPTIONS,
     ).learn(round(seconds / DT), callback)
-    tail = callback.episodes[-len(callback.episodes) // 10 :]
+    tail = callback.episodes[-math.ceil(len(callback.episodes) / 10) :]
     returns = [float(np.mean([episode.discounted_return for episode in tail]))]
     for other in AHEAD:
         env = RealTimeOptionWrapper(gym.make(ENV), other, **OPTIONS)

@@ -17,7 +17,7 @@ from gymnasium import spaces
 
 from sb3_ctco import CTCO
 from sb3_ctco.common.evaluation import evaluate_discounted_return
-from sb3_ctco.wrappers.real_time_options import RealTimeOptionWrapper
+from sb3_ctco.wrappers import RealTimeOptionWrapper
 
 SPEEDS = (0.0, 0.1, 0.2, 0.4, 0.8)
 #: How far the target must have moved to end an option
