@@ -124,13 +124,16 @@ class SoftOptionActorCritic(OptionOffPolicyAlgorithm):
             # A duration that is fixed has no entropy to be paid for.
             duration_coef, duration_learned = 0.0, False
         self._ent_coef_learned = th.tensor([learned, duration_learned], device=self.device)
-        self._target_entropies = th.tensor(
-            [FloatSchedule(self.target_entropy)(1.0), FloatSchedule(self.duration_target_entropy)(1.0)], device=self.device
-        )
+        self._target_entropies = th.tensor(self._current_target_entropies(), device=self.device)
         self.log_ent_coefs = th.tensor([coef, duration_coef], device=self.device).log().requires_grad_(True)
         self.ent_coef_optimizer: th.optim.Adam | None = None
         if learned or duration_learned:
             self.ent_coef_optimizer = th.optim.Adam([self.log_ent_coefs], lr=self.lr_schedule(1), fused=True)
+
+    def _current_target_entropies(self) -> tuple[float, float]:
+        """The target entropies of what to do and of the duration, at the remaining progress."""
+        remaining = self._current_progress_remaining
+        return FloatSchedule(self.target_entropy)(remaining), FloatSchedule(self.duration_target_entropy)(remaining)
 
     def _sample_policy(self, obs: PyTorchObs) -> tuple[th.Tensor, ...]:
         """Sample the policy, reparameterised.
@@ -164,9 +167,7 @@ class SoftOptionActorCritic(OptionOffPolicyAlgorithm):
             optimizers.append(self.ent_coef_optimizer)
         self._update_learning_rate(optimizers)
 
-        for part, target in enumerate((self.target_entropy, self.duration_target_entropy)):
-            if callable(target):
-                self._target_entropies[part] = target(self._current_progress_remaining)
+        self._target_entropies.copy_(th.tensor(self._current_target_entropies()))
         losses = []
         for _ in range(gradient_steps):
             data = self.replay_buffer.sample(batch_size, env=self._vec_normalize_env)

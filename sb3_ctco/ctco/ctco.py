@@ -109,6 +109,8 @@ class CTCO(SoftOptionActorCritic):
     :param target_entropy: entropy of ω over the box [−1, 1] that a learned temperature keeps, or a function of the
         remaining progress; ``"auto"`` is −dim(ω)
     :param duration_target_entropy: likewise for d; ``"auto"`` is −1
+    :param target_entropy_anneal: the last fraction of training, in [0, 1], in which both target entropies fall, linearly, by
+        one nat a dimension in all: explore first, then get precise; 0 keeps them
     :param duration_learning_rate: step size of d's head; ``learning_rate`` by default
     :param entropy_reference: ``"uniform"``, ``"paper"`` or ``"duration"``, see :func:`log_reference_density`
     :param action_noise: noise added to normalised options while exploring
@@ -160,6 +162,7 @@ class CTCO(SoftOptionActorCritic):
         duration_ent_coef: str | float = "auto_0.02",
         target_entropy: str | float | Schedule = "auto",
         duration_target_entropy: str | float | Schedule = "auto",
+        target_entropy_anneal: float = 0.0,
         duration_learning_rate: float | Schedule | None = None,
         entropy_reference: EntropyReference = "uniform",
         action_noise: ActionNoise | None = None,
@@ -175,6 +178,8 @@ class CTCO(SoftOptionActorCritic):
     ):
         if entropy_reference not in ENTROPY_REFERENCES:
             raise ValueError(f"entropy_reference must be one of {ENTROPY_REFERENCES}, not {entropy_reference!r}")
+        if not 0.0 <= target_entropy_anneal <= 1.0:
+            raise ValueError(f"target_entropy_anneal must be a fraction of training in [0, 1], not {target_entropy_anneal}")
         if target_decision_rate is not None and not target_decision_rate > 0:
             raise ValueError(f"target_decision_rate must be a positive number of Hz or None, not {target_decision_rate}")
         if target_decision_rate is not None and not (isinstance(high_freq_penalty, int | float) and high_freq_penalty > 0):
@@ -216,6 +221,7 @@ class CTCO(SoftOptionActorCritic):
         )
         self.high_freq_penalty = high_freq_penalty
         self.target_decision_rate = target_decision_rate
+        self.target_entropy_anneal = target_entropy_anneal
         self.duration_learning_rate = duration_learning_rate
         self.entropy_reference: EntropyReference = entropy_reference
 
@@ -270,6 +276,13 @@ class CTCO(SoftOptionActorCritic):
 
     def _auto_target_entropies(self) -> tuple[float, float]:
         return float(-self.actor.omega_dim), -1.0
+
+    def _current_target_entropies(self) -> tuple[float, float]:
+        target, duration_target = super()._current_target_entropies()
+        if self.target_entropy_anneal == 0:
+            return target, duration_target
+        annealed = max(0.0, 1.0 - self._current_progress_remaining / self.target_entropy_anneal)
+        return target - annealed * self.actor.omega_dim, duration_target - annealed
 
     def _update_learning_rate(self, optimizers: list[th.optim.Optimizer] | th.optim.Optimizer) -> None:
         super()._update_learning_rate(optimizers)
