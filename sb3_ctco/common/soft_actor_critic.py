@@ -132,6 +132,8 @@ class SoftOptionActorCritic(OptionOffPolicyAlgorithm):
 
     def _current_target_entropies(self) -> tuple[float, float]:
         """The target entropies of what to do and of the duration, at the remaining progress."""
+        # "auto" was resolved when the temperatures were set up.
+        assert not isinstance(self.target_entropy, str) and not isinstance(self.duration_target_entropy, str)
         remaining = self._current_progress_remaining
         return FloatSchedule(self.target_entropy)(remaining), FloatSchedule(self.duration_target_entropy)(remaining)
 
