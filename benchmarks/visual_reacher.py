@@ -79,19 +79,20 @@ def draw(path: Path) -> None:
         for ax, column in zip(axes[:, int(difficulty == "hard")], ("discounted_return", "decision_rate_hz"), strict=True):
             values = np.array([float(row[column]) for row in rows])
             smooth = np.convolve(values, np.ones(WINDOW) / WINDOW, mode="valid")
-            known = ax.get_legend_handles_labels()[1]
-            ax.plot(minutes[WINDOW - 1 :], smooth, color=colour, label=None if label in known else label)
+            ax.plot(minutes[WINDOW - 1 :], smooth, color=colour, label=label)
     for algorithm, value in PAPER.items():
         label, colour = LABELS[algorithm, "4" if algorithm == "ctco" else "0", "False"]
-        axes[0, 0].axhline(value, color=colour, linestyle=":", label=f"{label}, the paper's robot, 95 min")
+        axes[0, 0].axhline(value, color=colour, linestyle=":", label=f"{label}, the paper's robot after 95 min")
     axes[0, 0].set_ylabel("discounted return")
     axes[1, 0].set_ylabel("decisions a second")
     axes[1, 0].set_yscale("log")
     for ax, title in zip(axes[0], ("easy, 50 Hz", "hard, 50 Hz"), strict=True):
         ax.set_title(title)
-        ax.legend(fontsize="small")
     for ax in axes[1]:
         ax.set_xlabel("task time [min]")
+    handles, labels = axes[0, 0].get_legend_handles_labels()
+    legend = dict(zip(labels, handles, strict=True))
+    figure.legend(legend.values(), legend.keys(), loc="outside upper center", ncols=3, fontsize="small")
     path.parent.mkdir(parents=True, exist_ok=True)
     figure.savefig(path, dpi=110)
 
