@@ -1,6 +1,7 @@
 """The frequency study: its grid, its runs in folders, the engines, records and figures."""
 
 import csv
+import dataclasses
 import json
 import math
 import os
@@ -76,7 +77,7 @@ def test_the_presets_are_the_grids_that_they_should_be():
     paper, quick = load_preset("paper"), load_preset("quick")
     assert len(paper.select(settings=["paper"])) == 30 * 4 * 3 * 4
     assert {run.task_seconds for run in paper.runs} == {400 * 60}
-    assert len(quick.runs) == 2 * 5 * 3 * 4
+    assert len(quick.runs) == 5 * 3 * 4
     for preset in (paper, quick):
         assert {run.rate for run in preset.runs} == {50, 100, 250, 500}
         assert {run.task for run in preset.runs} == {"point_mass", "cheetah", "ball_in_cup"}
@@ -90,8 +91,20 @@ def test_the_presets_are_the_grids_that_they_should_be():
     ctco = paper.select(algorithms=["ctco"], settings=["paper"])[0].arguments
     assert (ctco["high_freq_penalty"], ctco["n_rbf"]) == (0.05, 3)
     # A seed is complete before the next one begins, and in it the runs that take longest are first.
-    assert [run.seed for run in quick.runs] == [0] * 60 + [1] * 60
-    assert [run.rate for run in quick.runs[:60]] == sorted((run.rate for run in quick.runs[:60]), reverse=True)
+    learning = load_preset("learning")
+    assert [run.seed for run in learning.runs] == [0] * 18 + [1] * 18 + [2] * 18
+    for runs in (learning.runs[:18], quick.runs):
+        assert [run.rate for run in runs] == sorted((run.rate for run in runs), reverse=True)
+
+
+def test_seeds_may_be_others_than_the_presets() -> None:
+    quick = load_preset("quick")
+    runs = quick.select(tasks=["cheetah"], seeds=[5, 0])
+    assert [run.seed for run in runs] == [5] * 20 + [0] * 20
+    assert runs[20:] == quick.select(tasks=["cheetah"])
+    assert runs[0] == dataclasses.replace(runs[20], seed=5)
+    with pytest.raises(ValueError, match=r"seeds must not be negative: \[-1\]"):
+        quick.select(seeds=[-1])
 
 
 @pytest.mark.parametrize("name", ["smoke", "quick", "paper"])

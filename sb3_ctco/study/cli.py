@@ -41,8 +41,9 @@ def _parser() -> argparse.ArgumentParser:
     run.add_argument("--engine", choices=("local", "ray"), default="local", help="processes of this machine, or Ray")
     run.add_argument("--address", help="of a running Ray cluster, such as auto; by default Ray is started here")
     run.add_argument("--skip-records", type=Path, metavar="CSV", help="skip the runs that a file of `collect` has")
-    for name, kind in (("tasks", str), ("rates", int), ("algorithms", str), ("settings", str), ("seeds", int)):
+    for name, kind in {"tasks": str, "rates": int, "algorithms": str, "settings": str}.items():
         run.add_argument(f"--{name}", nargs="+", type=kind, help=f"only these {name} of the preset")
+    run.add_argument("--seeds", nargs="+", type=int, help="these in place of the preset's, which begin at 0")
     run.set_defaults(call=_run)
 
     status = commands.add_parser("status", help="how far a study is")

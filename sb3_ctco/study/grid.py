@@ -91,15 +91,19 @@ class Preset:
     ) -> list[Run]:
         """The runs that pass all filters; None lets all pass.
 
-        :raises ValueError: if a filter names what no run of the preset has
+        :param seeds: any, not only the preset's, since seeds differ in nothing else
+        :raises ValueError: if another filter names what no run of the preset has, or for a negative seed
         """
         chosen = list(self.runs)
+        if seeds is not None:
+            if min(seeds, default=0) < 0:
+                raise ValueError(f"seeds must not be negative: {list(seeds)}")
+            chosen = [dataclasses.replace(run, seed=seed) for seed in seeds for run in chosen if run.seed == 0]
         filters: dict[str, Sequence[Any] | None] = {
             "task": tasks,
             "rate": rates,
             "algorithm": algorithms,
             "setting": settings,
-            "seed": seeds,
         }
         for name, wanted in filters.items():
             if wanted is None:
