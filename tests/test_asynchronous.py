@@ -196,7 +196,25 @@ def test_resume_continues_with_all_that_was_collected(tmp_path):
     assert len(records) > n_records
     assert records[-1].num_timesteps == model.num_timesteps >= steps + 60
     trainer.restore_replay_buffer()
-    assert model.replay_buffer.size() == len(records)
+    assert model.replay_buffer.n_decisions == len(records)
+
+
+def test_sub_options_are_in_the_learners_replay_buffer(tmp_path):
+    arguments = {"n_sub_options": 4, "d_max": 0.5}
+    # With random options only, so that both do the same.
+    there = make_model(CTCO, env := Point(), **arguments)
+    there.learning_starts = 1000
+    with AsynchronousTrainer(there, env, tmp_path, real_time=False) as trainer:
+        trainer.learn(200)
+        trainer.restore_replay_buffer()
+    here = make_model(CTCO, Point(), **arguments)
+    here.learning_starts = 1000
+    here.learn(200)
+    assert here.replay_buffer.n_decisions == there.replay_buffer.n_decisions == len(records_of(tmp_path))
+    size = here.replay_buffer.size()
+    assert size == there.replay_buffer.size() > 2 * here.replay_buffer.n_decisions
+    for name in ("observations", "next_observations", "actions", "durations", "integrated_rewards", "dones", "timeouts"):
+        np.testing.assert_array_equal(getattr(there.replay_buffer, name)[:size], getattr(here.replay_buffer, name)[:size])
 
 
 def test_exception_of_the_environment_stops_both(tmp_path):

@@ -730,3 +730,13 @@ def test_docstrings_run():
     result = doctest.testmod(module)
     assert result.attempted > 3
     assert result.failed == 0
+
+
+def test_training_mode_is_that_of_the_networks() -> None:
+    model = CTCO("MlpPolicy", "Pendulum-v1", d_max=0.5)
+    for training in (True, True, False, False, True):
+        model.policy.set_training_mode(training)
+        assert model.actor.training is model.critic.training is training
+        assert not model.actor_target.training
+    model.predict(np.zeros(3))
+    assert not model.actor.training

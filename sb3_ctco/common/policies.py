@@ -201,6 +201,11 @@ class SoftOptionPolicy(sac_policies.SACPolicy):
         super()._build(lr_schedule)
         self.critic_target.requires_grad_(False)
 
+    def set_training_mode(self, mode: bool) -> None:
+        """Stable-Baselines3's, which asks for a mode before each decision; most often it is that mode already."""
+        if mode != self.training:
+            super().set_training_mode(mode)
+
     def make_actor(self, features_extractor: BaseFeaturesExtractor | None = None) -> Any:
         """An actor; with a features extractor of its own unless one is given."""
         kwargs = self._update_features_extractor(self.net_args, features_extractor)

@@ -339,9 +339,8 @@ class _JournalBuffer:
         self._model = model
 
     def add(self, obs: Any, next_obs: Any, action: Any, reward: Any, done: Any, infos: list[dict[str, Any]]) -> None:
-        kept: list[dict[str, Any]] = [
-            {key: info[key] for key in ("TimeLimit.truncated", "option") if key in info} for info in infos
-        ]
+        used = ("TimeLimit.truncated", "option", "sub_options")
+        kept: list[dict[str, Any]] = [{key: info[key] for key in used if key in info} for info in infos]
         # Stable-Baselines3 hands over arrays of its own, except for the observations, which the next step writes over.
         self._journal.add(Transition(_copy(obs), _copy(next_obs), action, reward, done, kept, self._model.num_timesteps))
 
