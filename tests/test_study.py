@@ -93,8 +93,8 @@ def test_the_presets_are_the_grids_that_they_should_be():
     # A seed is complete before the next one begins, and in it the runs that take longest are first.
     learning = load_preset("learning")
     assert [run.seed for run in learning.runs] == [0] * 18 + [1] * 18 + [2] * 18
-    for runs in (learning.runs[:18], quick.runs):
-        assert [run.rate for run in runs] == sorted((run.rate for run in runs), reverse=True)
+    for seed in (learning.runs[:18], quick.runs):
+        assert [run.rate for run in seed] == sorted((run.rate for run in seed), reverse=True)
 
 
 def test_seeds_may_be_others_than_the_presets() -> None:
