@@ -346,9 +346,7 @@ def open_files(pid: int) -> set[str]:
 def synthetic(n_seeds: int = 2) -> list[dict]:
     """Records whose returns are the paper's, ±0.1 with the seeds 0 and 1; CTCO with two settings."""
     records = []
-    for run in load_preset("quick").runs:
-        if run.seed >= n_seeds:
-            continue
+    for run in load_preset("quick").select(seeds=range(n_seeds)):
         value = paper_returns()[run.task, run.algorithm][run.rate] * (0.5 if run.setting == "paper" else 1.0)
         value += 0.1 * (2 * run.seed - 1)
         rate = 3.0 if run.algorithm == "ctco" else float(run.rate)

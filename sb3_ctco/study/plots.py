@@ -116,7 +116,8 @@ def draw_metric(records: Sequence[Record], metric: str) -> "Figure":
             means, half_widths = np.array([mean_and_interval(values) for values in rates.values()]).T
             _line_with_intervals(ax, list(rates), means, means - half_widths, means + half_widths, line, lines)
             for x, values in zip(_apart(list(rates), line, lines), rates.values(), strict=True):
-                ax.plot([x] * len(values), values, ".", color=_COLOURS[line[0]], markersize=3)
+                if len(values) > 1:
+                    ax.plot([x] * len(values), values, ".", color=_COLOURS[line[0]], markersize=3)
                 shown += values
         for algorithm in ALGORITHMS:
             if numbers := paper.get((task, algorithm)):
@@ -131,7 +132,10 @@ def draw_metric(records: Sequence[Record], metric: str) -> "Figure":
         else:
             _return_axis(ax, shown)
     axes[0][0].set_ylabel(METRICS[metric])
-    _legend(figure, axes[0][0], f"mean and 95 % interval (Student's t) of {_seeds(records)}; a dot a seed")
+    seeds = _seeds(records)
+    _legend(
+        figure, axes[0][0], seeds if seeds == "1 seed" else f"mean and 95 % interval (Student's t) of {seeds}; a dot a seed"
+    )
     return figure
 
 
@@ -151,7 +155,8 @@ def draw_interquartile_means(records: Sequence[Record], estimates: dict[str, Est
         ax.set_title(METRICS[metric].split(",\n")[1])
         ax.set_ylim(bottom=0.0)
     axes[0][0].set_ylabel("interquartile mean\nof discounted return × τ")
-    _legend(figure, axes[0][0], f"95 % intervals: stratified bootstrap over {_seeds(records)}")
+    seeds = _seeds(records)
+    _legend(figure, axes[0][0], seeds if seeds == "1 seed" else f"95 % intervals: stratified bootstrap over {seeds}")
     return figure
 
 
