@@ -112,6 +112,8 @@ class RealTimeWrapper(gym.Wrapper, RecordConstructorArgs):
         self.statistics = TickStatistics()
         self.total_statistics = TickStatistics()
         self._due: float | None = None
+        # Found once: to look for a protocol's methods takes as long as a cheap step.
+        self._machine = env if isinstance(env, SupportsSendReceive) else None
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
         """Reset the environment; the clock starts with the first command."""
@@ -132,10 +134,10 @@ class RealTimeWrapper(gym.Wrapper, RecordConstructorArgs):
         # Whole periods that were lost are not made up for.
         self._due = (now if lateness >= self.dt else self._due) + self.dt
 
-        if isinstance(self.env, SupportsSendReceive):
-            self.env.send(action)
+        if self._machine is not None:
+            self._machine.send(action)
             self._wait()
-            obs, reward, terminated, truncated, info = self.env.receive()
+            obs, reward, terminated, truncated, info = self._machine.receive()
         else:
             obs, reward, terminated, truncated, info = self.env.step(action)
             self._wait()
