@@ -451,9 +451,13 @@ def _sigterm_as_exit() -> Iterator[None]:
 
 @contextmanager
 def _prompt_threads() -> Iterator[None]:
-    """Let threads take turns sooner than every 5 ms, Python's default and more than a period at 500 Hz."""
+    """Let threads take turns sooner than every 5 ms, Python's default and more than a period at 500 Hz.
+
+    A tick may wait for several turns: 0.2 % were late by 1 ms with turns of 0.5 ms, 0.01 % with 0.1 ms
+    (``benchmarks/README.md``, "Keeping the clock").
+    """
     before = sys.getswitchinterval()
-    sys.setswitchinterval(5e-4)
+    sys.setswitchinterval(1e-4)
     try:
         yield
     finally:
