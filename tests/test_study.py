@@ -22,7 +22,7 @@ from rliable.metrics import aggregate_iqm
 from sb3_ctco.study import agents, plots, runs, status
 from sb3_ctco.study.cli import main
 from sb3_ctco.study.grid import Run, load_preset, preset_names
-from sb3_ctco.study.records import COLUMNS, collect, paper_returns, read_records
+from sb3_ctco.study.records import COLUMNS, collect, paper_returns, read_curves, read_records
 
 mpl.use("Agg")
 
@@ -480,16 +480,45 @@ def test_plot_of_a_csv_file_and_of_a_folder(finished, tmp_path, capsys):
         assert picture[..., :3].std() > 0.05  # not blank
     assert "FiGAR-SAC (large)" in (tmp_path / "figures" / "frequency.svg").read_text()
 
+
+def test_learning_curves_of_a_folder_and_of_a_csv_file(finished, tmp_path, capsys):
     _, folder = finished
-    assert main(["plot", str(folder), "--output", str(tmp_path / "tiny")]) == 0
-    assert "learning_curves.png" in capsys.readouterr().out
-    (axes,) = plots.draw_learning_curves(folder).axes
-    seconds = np.array([50, 60, 70, 80, 90, 100])
-    returns = [float(row["discounted_return"]) for row in csv.DictReader(next(folder.glob("*seed0/monitor.csv")).open())]
-    line = axes.get_lines()[0]
-    np.testing.assert_allclose(line.get_xdata(), seconds / 60)
-    # Half of ten episodes is the window.
-    np.testing.assert_allclose(line.get_ydata(), [np.mean(returns[i : i + 5]) for i in range(6)])
+    assert main(["collect", str(folder), "--into", str(tmp_path / "tiny.csv")]) == 0
+    assert read_curves(tmp_path / "tiny.csv") == read_curves(folder)
+    for source in (folder, tmp_path / "tiny.csv"):
+        assert main(["plot", str(source), "--output", str(tmp_path / "tiny")]) == 0
+        assert "learning_curves.png" in capsys.readouterr().out
+    (axes,) = plots.draw_learning_curves(read_curves(folder)).axes
+    files = sorted(folder.glob("*/monitor.csv"))
+    first, second = ([float(row["discounted_return"]) for row in csv.DictReader(file.open())] for file in files)
+    line, *others = axes.get_lines()
+    assert not others
+    np.testing.assert_allclose(line.get_xdata(), [50 / 60, 100 / 60])
+    # Half of ten episodes is the window; a point is the mean over both seeds.
+    means = np.mean([[np.mean(one[:5]), np.mean(one[5:])] for one in (first, second)], axis=0)
+    np.testing.assert_allclose(line.get_ydata(), means, atol=1e-5)
+    # The band by hand: t(0.975, 1) = 12.706 times half of the seeds' distance
+    band = axes.collections[0].get_paths()[0].vertices[:, 1]
+    half_width = 12.706 * abs(np.mean(first[5:]) - np.mean(second[5:])) / 2
+    assert half_width > 0
+    for bound in (means[1] - half_width, means[1] + half_width):
+        assert np.abs(band - bound).min() < 1e-3
+
+
+def test_collect_keeps_curves_of_other_folders(finished, tmp_path):
+    _, folder = finished
+    names = sorted(path.name for path in folder.iterdir())
+    for name in names:
+        shutil.copytree(folder / name, tmp_path / name / name)
+    # A run in flight has a curve, but no record.
+    (tmp_path / names[1] / "in_flight").mkdir()
+    for file in ("settings.json", "monitor.csv"):
+        text = (folder / names[1] / file).read_text().replace('"seed": 1', '"seed": 7')
+        (tmp_path / names[1] / "in_flight" / file).write_text(text)
+    for name in names:
+        collect([tmp_path / name], tmp_path / "all.csv")
+    assert {point["seed"] for point in read_curves(tmp_path / "all.csv")} == {0, 1}
+    assert {point["seed"] for point in read_curves(tmp_path / names[1])} == {1, 7}
 
 
 def test_status_estimates_the_time_left(finished, tmp_path, capsys):

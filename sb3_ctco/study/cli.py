@@ -50,13 +50,13 @@ def _parser() -> argparse.ArgumentParser:
     status.add_argument("folder", type=Path)
     status.set_defaults(call=_status)
 
-    collect = commands.add_parser("collect", help="merge the records of finished runs into one CSV file")
+    collect = commands.add_parser("collect", help="merge records and learning curves of finished runs into CSV files")
     collect.add_argument("folders", type=Path, nargs="+", metavar="folder")
-    collect.add_argument("--into", type=Path, required=True, metavar="CSV")
+    collect.add_argument("--into", type=Path, required=True, metavar="CSV", help="NAME.csv; curves go to NAME_curves.csv")
     collect.set_defaults(call=_collect)
 
     plot = commands.add_parser("plot", help="figures and a table")
-    plot.add_argument("source", type=Path, help="a study's folder, or a file of `collect` (without learning curves)")
+    plot.add_argument("source", type=Path, help="a study's folder, or a file of `collect`")
     plot.add_argument("--output", type=Path, metavar="DIR", help="SOURCE/figures by default, or figures beside the file")
     plot.set_defaults(call=_plot)
     return parser

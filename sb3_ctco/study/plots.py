@@ -1,6 +1,5 @@
 """Figures and tables of a study's records."""
 
-import csv
 import math
 from collections import Counter, defaultdict
 from collections.abc import Sequence
@@ -11,8 +10,7 @@ import numpy as np
 
 from sb3_ctco.options import DEFAULT_DISCOUNT_RATE
 from sb3_ctco.study.grid import ALGORITHMS, TASKS
-from sb3_ctco.study.records import Record, paper_returns, read_records
-from sb3_ctco.study.runs import MONITOR, SETTINGS
+from sb3_ctco.study.records import CURVE_EPISODES, Record, key, paper_returns, read_curves, read_records
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -29,8 +27,6 @@ _COLOURS = dict(zip(ALGORITHMS, ("C0", "C1", "C2", "C3"), strict=True))
 _DASHES = ("-", "-.", ":")
 #: Resamples of the bootstrap, as many as rliable's authors take for figures
 _BOOTSTRAP_REPETITIONS = 2000
-#: Training episodes that a point of a learning curve is the mean of
-_CURVE_EPISODES = 12
 
 #: An algorithm and its setting, which is a line of a figure
 Line = tuple[str, str]
@@ -52,13 +48,13 @@ def by_line(records: Sequence[Record], task: str, metric: str) -> dict[Line, dic
     lines: dict[Line, dict[int, list[float]]] = {line: defaultdict(list) for line in lines_of(records)}
     for record in records:
         if record["task"] == task:
-            lines[record["algorithm"], record["setting"]][_rate(record)].append(record[metric])
+            lines[_line_of(record)][_rate(record)].append(record[metric])
     return {line: dict(sorted(rates.items())) for line, rates in lines.items() if rates}
 
 
 def lines_of(records: Sequence[Record]) -> list[Line]:
     """Algorithms and settings that occur, in a fixed order."""
-    present = {(record["algorithm"], record["setting"]) for record in records}
+    present = {_line_of(record) for record in records}
     return sorted(present, key=lambda line: (ALGORITHMS.index(line[0]), line[1]))
 
 
@@ -77,10 +73,7 @@ def interquartile_means(records: Sequence[Record], metric: str) -> Estimates:
     from rliable.metrics import aggregate_iqm  # noqa: PLC0415
 
     tasks = tasks_of(records)
-    values = {
-        ((record["algorithm"], record["setting"]), _rate(record), record["seed"], record["task"]): record[metric]
-        for record in records
-    }
+    values = {(_line_of(record), _rate(record), record["seed"], record["task"]): record[metric] for record in records}
     rates = sorted({_rate(record) for record in records})
     seeds = sorted({record["seed"] for record in records})
     estimates: Estimates = {}
@@ -160,37 +153,40 @@ def draw_interquartile_means(records: Sequence[Record], estimates: dict[str, Est
     return figure
 
 
-def draw_learning_curves(folder: Path) -> "Figure":
-    """Discounted return of training episodes over task time: a row a rate, a column a task; a thin line a run."""
-    import json  # noqa: PLC0415
+def draw_learning_curves(points: Sequence[Record]) -> "Figure":
+    """Discounted return of training episodes over task time, mean over seeds: a row a rate, a column a task.
 
-    curves: dict[tuple[str, int, Line], list[tuple[np.ndarray, np.ndarray]]] = defaultdict(list)
-    for file in sorted(folder.glob(f"*/{MONITOR}")):
-        settings = json.loads((file.parent / SETTINGS).read_text(encoding="utf-8"))
-        curve = _read_curve(file)
-        if curve is not None:
-            line = (settings["algorithm"], settings["setting"])
-            curves[settings["task"], settings["rate"], line].append(curve)
-    tasks = [task for task in TASKS if any(key[0] == task for key in curves)]
-    rates = sorted({key[1] for key in curves})
-    lines = sorted({key[2] for key in curves}, key=lambda line: (ALGORITHMS.index(line[0]), line[1]))
+    :param points: of :func:`~sb3_ctco.study.records.read_curves`
+    """
+    tasks, lines = tasks_of(points), lines_of(points)
+    rates = sorted({_rate(point) for point in points})
+    values: dict[tuple[str, int, Line], dict[float, list[float]]] = defaultdict(lambda: defaultdict(list))
+    for point in points:
+        curve = values[point["task"], _rate(point), _line_of(point)]
+        curve[point["seconds"]].append(point["discounted_return"])
     figure, axes = _panels(len(rates), len(tasks))
     for row, rate in zip(axes, rates, strict=True):
         for ax, task in zip(row, tasks, strict=True):
+            shown = [0.0]
             for line in lines:
+                curve = dict(sorted(values[task, rate, line].items()))
                 style, label = _style(line, lines)
-                for number, (seconds, returns) in enumerate(curves[task, rate, line]):
-                    ax.plot(seconds / 60, returns, **{**style, "linewidth": 1.0}, label=label if number == 0 else None)
+                minutes = np.array(list(curve)) / 60
+                means, half_widths = np.array([mean_and_interval(one) for one in curve.values()]).reshape(-1, 2).T
+                ax.plot(minutes, means, linewidth=1.2, label=label, **style)
+                ax.fill_between(
+                    minutes, means - half_widths, means + half_widths, color=style["color"], alpha=0.15, linewidth=0
+                )
+                shown += means.tolist()
             ax.set_title(f"{TASK_NAMES[task]}, {rate} Hz")
-            ax.set_ylim(bottom=min(0.0, ax.dataLim.y0))
+            _return_axis(ax, shown)
         row[0].set_ylabel("discounted return")
     for ax in axes[-1]:
         ax.set_xlabel("task time [min]")
-    _legend(
-        figure,
-        axes[0][0],
-        f"a line a seed; mean of (up to) {_CURVE_EPISODES} training episodes",
-    )
+    seeds = _seeds(list({key(point): point for point in points}.values()))
+    episodes = f"mean of (up to) {CURVE_EPISODES} training episodes"
+    interval = "" if seeds == "1 seed" else f"; mean and 95 % interval (Student's t) of {seeds}"
+    _legend(figure, axes[0][0], episodes + interval)
     return figure
 
 
@@ -241,7 +237,7 @@ def table(records: Sequence[Record], estimates: dict[str, Estimates]) -> str:
 def plot(source: Path, output: Path) -> list[Path]:
     """Draw everything that a study's folder, or a CSV file of its records, has the data for.
 
-    :param source: the folder or file; a file has no learning curves
+    :param source: the folder or file; the learning curves of a file are in the one beside it
     :param output: folder for figures (PNG and SVG) and ``table.md``
     :return: the files written
     """
@@ -261,8 +257,8 @@ def plot(source: Path, output: Path) -> list[Path]:
         "decision_rates": draw_metric(records, "decision_rate_hz"),
         "interquartile_means": draw_interquartile_means(records, estimates),
     }
-    if source.is_dir():
-        figures["learning_curves"] = draw_learning_curves(source)
+    if points := read_curves(source):
+        figures["learning_curves"] = draw_learning_curves(points)
     written = []
     for name, figure in figures.items():
         for ending, metadata in (("png", None), ("svg", {"Date": None})):
@@ -285,16 +281,8 @@ def _seeds(records: Sequence[Record]) -> str:
     return f"{most} seed{'s' * (most > 1)}" if fewest == most else f"{fewest} to {most} seeds"
 
 
-def _read_curve(file: Path) -> tuple[np.ndarray, np.ndarray] | None:
-    """Task time in s and smoothed return of a run's training episodes; None if there are too few."""
-    with file.open(newline="") as stream:
-        rows = [row for row in csv.DictReader(stream) if row["wall_seconds"]]
-    if len(rows) < 2:
-        return None
-    seconds = np.array([float(row["task_seconds"]) for row in rows])
-    returns = np.array([float(row["discounted_return"]) for row in rows])
-    window = min(_CURVE_EPISODES, len(rows) // 2)
-    return seconds[window - 1 :], np.convolve(returns, np.ones(window) / window, mode="valid")
+def _line_of(record: Record) -> Line:
+    return record["algorithm"], record["setting"]
 
 
 def _panels(n_rows: int, n_columns: int) -> tuple["Figure", np.ndarray]:

@@ -1,15 +1,15 @@
-"""Records of finished runs: one row a run, from folders or from one CSV file."""
+"""Records and learning curves of runs, from folders or from CSV files."""
 
 import csv
 import io
 import json
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from importlib import resources
 from pathlib import Path
 from typing import Any
 
 from sb3_ctco.study.grid import Run
-from sb3_ctco.study.runs import RECORD, write_whole
+from sb3_ctco.study.runs import MONITOR, RECORD, SETTINGS, write_whole
 
 Record = dict[str, Any]
 
@@ -33,6 +33,14 @@ COLUMNS: dict[str, type] = {
     "versions": str,
 }
 _KEY = ("preset", "task", "algorithm", "setting", "dt", "seed")
+#: Columns of the CSV file of learning curves: whose point it is, its task time in s, and its return
+CURVE_COLUMNS: dict[str, type] = {
+    **{name: COLUMNS[name] for name in _KEY},
+    "seconds": float,
+    "discounted_return": float,
+}
+#: Training episodes that a point of a learning curve is the mean of
+CURVE_EPISODES = 12
 
 
 def key(record: Record) -> tuple[Any, ...]:
@@ -53,12 +61,7 @@ def read_records(source: Path) -> list[Record]:
     if source.is_dir():
         records = [json.loads(file.read_text(encoding="utf-8")) for file in sorted(source.glob(f"*/{RECORD}"))]
     elif source.is_file():
-        with source.open(newline="", encoding="utf-8") as file:
-            reader = csv.DictReader(file)
-            missing = [name for name in COLUMNS if name not in (reader.fieldnames or ())]
-            if missing:
-                raise ValueError(f"{source} lacks the columns {missing}: pass a file that `sb3-ctco study collect` wrote")
-            records = [{name: kind(row[name]) for name, kind in COLUMNS.items()} for row in reader]
+        records = _read_csv(source, COLUMNS)
     else:
         raise ValueError(f"there is no folder or CSV file {source}")
     if not records:
@@ -66,27 +69,80 @@ def read_records(source: Path) -> list[Record]:
     return records
 
 
+def curves_file(file: Path) -> Path:
+    """Where :func:`collect` puts learning curves: ``NAME_curves.csv`` beside ``NAME.csv``."""
+    return file.with_name(f"{file.stem}_curves.csv")
+
+
+def read_curves(source: Path) -> list[Record]:
+    """Learning curves of a study's folder (of runs in flight, too), or those beside a CSV file; empty if there are none.
+
+    :return: points, each the mean of (up to) ``CURVE_EPISODES`` training episodes and the task time at the end of the last
+    """
+    if not source.is_dir():
+        file = curves_file(source)
+        return _read_csv(file, CURVE_COLUMNS) if file.exists() else []
+    return [point for file in sorted(source.glob(f"*/{MONITOR}")) for point in _curve(file.parent)]
+
+
 def collect(folders: Sequence[Path], into: Path) -> tuple[int, int]:
-    """Merge the records of folders into a CSV file; rows that it has stay as they are.
+    """Merge records of folders into a CSV file, and learning curves into one beside it; what they have stays as it is.
 
     :param folders: of studies
-    :param into: the file, made if there is none
+    :param into: the file, made if there is none; see :func:`curves_file` for the other
     :return: the number of rows that are new, and of all rows
     :raises ValueError: if a run is there already with other settings
     """
     merged = {key(record): record for record in read_records(into)} if into.exists() else {}
+    curves: dict[tuple[Any, ...], list[Record]] = {}
+    for point in read_curves(into):
+        curves.setdefault(key(point), []).append(point)
     n_before = len(merged)
     for folder in folders:
         for record in read_records(folder):
             there = merged.setdefault(key(record), record)
             _refuse_other_fingerprint(there["fingerprint"], record["fingerprint"], key(record), into)
-    stream = io.StringIO()
-    writer = csv.DictWriter(stream, list(COLUMNS), lineterminator="\n")
-    writer.writeheader()
-    writer.writerows(merged[name] for name in sorted(merged))
+        of_folder: dict[tuple[Any, ...], list[Record]] = {}
+        for point in read_curves(folder):
+            of_folder.setdefault(key(point), []).append(point)
+        curves = {**{name: points for name, points in of_folder.items() if name in merged}, **curves}
     into.parent.mkdir(parents=True, exist_ok=True)
-    write_whole(into, stream.getvalue())
+    points = (point for name in sorted(curves) for point in curves[name])
+    write_whole(curves_file(into), _as_csv(CURVE_COLUMNS, points))
+    write_whole(into, _as_csv(COLUMNS, (merged[name] for name in sorted(merged))))
     return len(merged) - n_before, len(merged)
+
+
+def _curve(run_folder: Path) -> Iterator[Record]:
+    settings = json.loads((run_folder / SETTINGS).read_text(encoding="utf-8"))
+    with (run_folder / MONITOR).open(newline="", encoding="utf-8") as file:
+        rows = [row for row in csv.DictReader(file) if row["wall_seconds"]]  # The last may be half written.
+    window = min(CURVE_EPISODES, len(rows) // 2)
+    for end in range(window, len(rows) + 1, window) if window else ():
+        returns = [float(row["discounted_return"]) for row in rows[end - window : end]]
+        yield {
+            **{name: settings[name] for name in _KEY if name != "dt"},
+            "dt": 1.0 / settings["rate"],
+            "seconds": float(rows[end - 1]["task_seconds"]),
+            "discounted_return": round(sum(returns) / window, 5),
+        }
+
+
+def _read_csv(file: Path, columns: dict[str, type]) -> list[Record]:
+    with file.open(newline="", encoding="utf-8") as stream:
+        reader = csv.DictReader(stream)
+        missing = [name for name in columns if name not in (reader.fieldnames or ())]
+        if missing:
+            raise ValueError(f"{file} lacks the columns {missing}: pass a file that `sb3-ctco study collect` wrote")
+        return [{name: kind(row[name]) for name, kind in columns.items()} for row in reader]
+
+
+def _as_csv(columns: dict[str, type], rows: Iterable[Record]) -> str:
+    stream = io.StringIO()
+    writer = csv.DictWriter(stream, list(columns), lineterminator="\n")
+    writer.writeheader()
+    writer.writerows(rows)
+    return stream.getvalue()
 
 
 def without_recorded(runs: Iterable[Run], file: Path) -> list[Run]:
