@@ -6,7 +6,8 @@ Runs of preset quick (setting tuned), which is what to compare with, plus
 
 - ``layer_norm``: layer normalisation (without learned scales) after each hidden layer of the critics,
 - ``two_step``: two decisions in a row as one transition, R₁ + γ(d₁)·(R₂ − β_h) over d₁ + d₂; sub-options as ever,
-- ``updates_40``: 40 updates a second of task time in place of 20.
+- ``updates_40``: 40 updates a second of task time in place of 20,
+- ``anneal_2``: target entropies that fall by two nats a dimension, not by one.
 
 A row a run goes to results/extras.csv; rows that are there are skipped.
 """
@@ -18,6 +19,7 @@ import time
 from pathlib import Path
 from typing import Any
 
+import gymnasium as gym
 import numpy as np
 import torch as th
 from torch import nn
@@ -85,6 +87,11 @@ def make_model(run: Run, variant: str) -> CTCO:
     arguments = agents.constructor_arguments(run)
     if variant == "updates_40":
         arguments["updates_per_second"] = 40
+    if variant == "anneal_2":
+        last = arguments["target_entropy_anneal"]  # by which they fall by one nat, and these functions by another
+        dim = arguments["n_rbf"] * gym.make(run.env_id).action_space.shape[0]
+        arguments["target_entropy"] = lambda left: -dim - dim * max(0.0, 1.0 - left / last)
+        arguments["duration_target_entropy"] = lambda left: -1.0 - max(0.0, 1.0 - left / last)
     if variant == "two_step":
         arguments["replay_buffer_class"] = TwoStepBuffer
     policy = LayerNormPolicy if variant == "layer_norm" else "MlpPolicy"
@@ -122,7 +129,7 @@ def perform(run: Run, variant: str) -> dict[str, Any]:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("variant", choices=("layer_norm", "two_step", "updates_40"))
+    parser.add_argument("variant", choices=("layer_norm", "two_step", "updates_40", "anneal_2"))
     parser.add_argument("--tasks", nargs="+", choices=list(TASKS), default=list(TASKS))
     parser.add_argument("--rate", type=int, choices=STUDY_RATES, default=500)
     parser.add_argument("--seed", type=int, default=0)
