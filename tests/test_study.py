@@ -433,7 +433,7 @@ def test_the_figure_shows_the_records_and_the_paper():
         )
         # The first line's interval at 50 Hz, by hand: t(0.975, 1) = 12.706 times 0.2/√2/√2.
         (_, low), (_, high) = ax.collections[0].get_segments()[0]
-        mean = 0.5 * paper_returns()[task, "ctco"][50]
+        mean = paper_returns()[task, "ctco"][50]
         assert (low, high) == pytest.approx((mean - 1.2706, mean + 1.2706), rel=1e-3)
 
 

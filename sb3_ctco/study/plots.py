@@ -53,9 +53,9 @@ def by_line(records: Sequence[Record], task: str, metric: str) -> dict[Line, dic
 
 
 def lines_of(records: Sequence[Record]) -> list[Line]:
-    """Algorithms and settings that occur, in a fixed order."""
+    """Algorithms and settings that occur, in a fixed order; the paper's settings come after others."""
     present = {_line_of(record) for record in records}
-    return sorted(present, key=lambda line: (ALGORITHMS.index(line[0]), line[1]))
+    return sorted(present, key=lambda line: (ALGORITHMS.index(line[0]), line[1] == "paper", line[1]))
 
 
 def tasks_of(records: Sequence[Record]) -> list[str]:
