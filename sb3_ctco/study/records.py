@@ -94,23 +94,27 @@ def collect(folders: Sequence[Path], into: Path) -> tuple[int, int]:
     :raises ValueError: if a run is there already with other settings
     """
     merged = {key(record): record for record in read_records(into)} if into.exists() else {}
-    curves: dict[tuple[Any, ...], list[Record]] = {}
-    for point in read_curves(into):
-        curves.setdefault(key(point), []).append(point)
+    curves = _by_run(read_curves(into))
     n_before = len(merged)
     for folder in folders:
+        of_folder = _by_run(read_curves(folder))
         for record in read_records(folder):
-            there = merged.setdefault(key(record), record)
-            _refuse_other_fingerprint(there["fingerprint"], record["fingerprint"], key(record), into)
-        of_folder: dict[tuple[Any, ...], list[Record]] = {}
-        for point in read_curves(folder):
-            of_folder.setdefault(key(point), []).append(point)
-        curves = {**{name: points for name, points in of_folder.items() if name in merged}, **curves}
+            name = key(record)
+            there = merged.setdefault(name, record)
+            _refuse_other_fingerprint(there["fingerprint"], record["fingerprint"], name, into)
+            curves.setdefault(name, of_folder.get(name, []))
     into.parent.mkdir(parents=True, exist_ok=True)
     points = (point for name in sorted(curves) for point in curves[name])
     write_whole(curves_file(into), _as_csv(CURVE_COLUMNS, points))
     write_whole(into, _as_csv(COLUMNS, (merged[name] for name in sorted(merged))))
     return len(merged) - n_before, len(merged)
+
+
+def _by_run(points: Iterable[Record]) -> dict[tuple[Any, ...], list[Record]]:
+    curves: dict[tuple[Any, ...], list[Record]] = {}
+    for point in points:
+        curves.setdefault(key(point), []).append(point)
+    return curves
 
 
 def _curve(run_folder: Path) -> Iterator[Record]:
