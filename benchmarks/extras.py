@@ -59,10 +59,20 @@ class LayerNormPolicy(CTCOPolicy):
 class TwoStepBuffer(OptionReplayBuffer):
     """Of one environment: stores each decision together with the one that follows it."""
 
-    high_freq_penalty: float
-    previous: tuple[np.ndarray, np.ndarray, dict[str, Any]] | None = None
+    def __init__(self, *args: Any, high_freq_penalty: float, **kwargs: Any):
+        super().__init__(*args, **kwargs)
+        self.high_freq_penalty = high_freq_penalty
+        self.previous: tuple[np.ndarray, np.ndarray, dict[str, Any]] | None = None
 
-    def add(self, obs, next_obs, action, reward, done, infos) -> None:  # type: ignore[no-untyped-def, override]
+    def add(
+        self,
+        obs: np.ndarray,
+        next_obs: np.ndarray,
+        action: np.ndarray,
+        reward: np.ndarray,
+        done: np.ndarray,
+        infos: list[dict[str, Any]],
+    ) -> None:
         (info,) = infos
         option = info["option"]
         if self.previous is None:
@@ -94,11 +104,9 @@ def make_model(run: Run, variant: str) -> CTCO:
         arguments["duration_target_entropy"] = lambda left: -1.0 - max(0.0, 1.0 - left / last)
     if variant == "two_step":
         arguments["replay_buffer_class"] = TwoStepBuffer
+        arguments["replay_buffer_kwargs"] = {"high_freq_penalty": arguments["high_freq_penalty"]}
     policy = LayerNormPolicy if variant == "layer_norm" else "MlpPolicy"
-    model = CTCO(policy, run.env_id, seed=run.seed, device="cpu", **arguments)
-    if variant == "two_step":
-        model.replay_buffer.high_freq_penalty = model.high_freq_penalty  # type: ignore[union-attr]
-    return model
+    return CTCO(policy, run.env_id, seed=run.seed, device="cpu", **arguments)
 
 
 def perform(run: Run, variant: str) -> dict[str, Any]:

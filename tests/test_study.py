@@ -521,6 +521,16 @@ def test_collect_keeps_curves_of_other_folders(finished, tmp_path):
     assert {point["seed"] for point in read_curves(tmp_path / names[1])} == {1, 7}
 
 
+def test_collect_takes_no_curve_of_a_run_that_is_not_complete_there(finished, tmp_path):
+    _, folder = finished
+    collect([folder], tmp_path / "all.csv")
+    (tmp_path / "all_curves.csv").unlink()
+    shutil.copytree(folder, tmp_path / "again")
+    next((tmp_path / "again").glob("*seed0/record.json")).unlink()
+    assert collect([tmp_path / "again"], tmp_path / "all.csv") == (0, 2)
+    assert {point["seed"] for point in read_curves(tmp_path / "all.csv")} == {1}
+
+
 def test_status_estimates_the_time_left(finished, tmp_path, capsys):
     _, original = finished
     folder = tmp_path / "study"
