@@ -2,8 +2,9 @@
 
     python benchmarks/extras.py layer_norm --tasks point_mass cheetah ball_in_cup
 
-Runs of preset quick (setting tuned), which is what to compare with, plus
+Runs of preset quick (setting tuned) plus
 
+- ``nothing``: as it is shipped, to compare with,
 - ``layer_norm``: layer normalisation (without learned scales) after each hidden layer of the critics,
 - ``two_step``: two decisions in a row as one transition, R₁ + γ(d₁)·(R₂ − β_h) over d₁ + d₂; sub-options as ever,
 - ``updates_40``: 40 updates a second of task time in place of 20,
@@ -137,7 +138,7 @@ def perform(run: Run, variant: str) -> dict[str, Any]:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("variant", choices=("layer_norm", "two_step", "updates_40", "anneal_2"))
+    parser.add_argument("variant", choices=("nothing", "layer_norm", "two_step", "updates_40", "anneal_2"))
     parser.add_argument("--tasks", nargs="+", choices=list(TASKS), default=list(TASKS))
     parser.add_argument("--rate", type=int, choices=STUDY_RATES, default=500)
     parser.add_argument("--seed", type=int, default=0)
