@@ -182,11 +182,11 @@ class EnsembleCritic(BaseModel):
 
 
 class SoftOptionPolicy(sac_policies.SACPolicy):
-    """Actor, critics and target critics. Parameters are those of Stable-Baselines3's ``SACPolicy``, without gSDE, and one more.
+    """Actor, critics and target critics. Parameters are those of Stable-Baselines3's ``SACPolicy``, without gSDE.
 
     Adam runs fused unless ``optimizer_kwargs`` say otherwise.
 
-    :param layer_norm: whether the critics have layer normalisation, see :class:`EnsembleCritic`
+    :param layer_norm: further, whether the critics have layer normalisation, see :class:`EnsembleCritic`
     :raises ValueError: if gSDE (``use_sde``) is asked for, or less than one critic
     """
 

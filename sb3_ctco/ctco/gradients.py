@@ -361,7 +361,7 @@ def _times_transposed(gradient: th.Tensor, weight: th.Tensor) -> th.Tensor:
 
 
 def _is_plain(network: nn.Sequential, linear: type[nn.Module], layer_norm: bool = False) -> bool:
-    """Whether linear layers and rectifiers, with layer normalisation before these or not, alternate, beginning with the former."""
+    """Whether linear layers, layer normalisations if there are any, and rectifiers follow each other, in turns."""
     turns = [linear, nn.LayerNorm, nn.ReLU] if layer_norm else [linear, nn.ReLU]
     return len(network) > 0 and all(type(module) is turns[i % len(turns)] for i, module in enumerate(network))
 
