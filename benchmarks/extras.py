@@ -23,9 +23,12 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 import torch as th
+from torch import nn
 
 from sb3_ctco import CTCO, OptionReplayBuffer
 from sb3_ctco.common.evaluation import DiscountedReturnCallback, evaluate_discounted_return
+from sb3_ctco.common.policies import EnsembleLinear
+from sb3_ctco.ctco.policies import CTCOPolicy, OptionCritic
 from sb3_ctco.envs import STUDY_RATES
 from sb3_ctco.options import discount
 from sb3_ctco.study import agents
@@ -37,6 +40,21 @@ COLUMNS = (
     "variant", "task", "rate", "seed", "task_seconds", "discounted_return", "greedy_return", "decision_rate_hz",
     "updates", "wall_seconds", "commit",
 )  # fmt: skip
+
+
+class LayerNormCritic(OptionCritic):
+    def __init__(self, *args: Any, **kwargs: Any):
+        super().__init__(*args, **kwargs)
+        layers: list[nn.Module] = []
+        for layer in self.q_networks:
+            layers.append(layer)
+            if isinstance(layer, EnsembleLinear) and layer is not self.q_networks[-1]:
+                layers.append(nn.LayerNorm(layer.weight.shape[2], elementwise_affine=False))
+        self.q_networks = nn.Sequential(*layers)
+
+
+class LayerNormPolicy(CTCOPolicy):
+    critic_class = LayerNormCritic
 
 
 class TwoStepBuffer(OptionReplayBuffer):
@@ -88,9 +106,8 @@ def make_model(run: Run, variant: str) -> CTCO:
     if variant == "two_step":
         arguments["replay_buffer_class"] = TwoStepBuffer
         arguments["replay_buffer_kwargs"] = {"high_freq_penalty": arguments["high_freq_penalty"]}
-    if variant == "layer_norm":
-        arguments["policy_kwargs"] = {**arguments["policy_kwargs"], "layer_norm": True}
-    return CTCO("MlpPolicy", run.env_id, seed=run.seed, device="cpu", **arguments)
+    policy = LayerNormPolicy if variant == "layer_norm" else "MlpPolicy"
+    return CTCO(policy, run.env_id, seed=run.seed, device="cpu", **arguments)
 
 
 def perform(run: Run, variant: str) -> dict[str, Any]:

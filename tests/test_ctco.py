@@ -683,19 +683,6 @@ def test_training_continues_from_a_saved_model_and_buffer(tmp_path, random_walk_
     np.testing.assert_array_equal(policy.predict(obs, deterministic=True)[0], model.predict(obs, deterministic=True)[0])
 
 
-def test_layer_normalisation(random_walk_env, tmp_path):
-    model = make(random_walk_env(), policy_kwargs={"net_arch": [8], "layer_norm": True}).learn(40)
-    linear, last = model.critic.q_networks[0], model.critic.q_networks[-1]
-    obs, options = th.randn(5, 2), th.rand(5, model.action_space.shape[0])
-    hidden = linear(th.cat((obs, options), dim=1).expand(2, -1, -1))
-    mean, variance = hidden.mean(dim=2, keepdim=True), hidden.var(dim=2, keepdim=True, unbiased=False)
-    expected = last(((hidden - mean) / (variance + 1e-5).sqrt()).relu())
-    th.testing.assert_close(model.critic(obs, options), expected)
-    model.policy.save(tmp_path / "policy")
-    policy = CTCOPolicy.load(tmp_path / "policy")
-    th.testing.assert_close(policy.critic(obs, options), expected)
-
-
 def test_same_seed_same_result(random_walk_env):
     def run(seed):
         model = make(random_walk_env(), seed=seed).learn(120)

@@ -100,7 +100,6 @@ class StopsAt(BaseCallback):
         {"policy_kwargs": {"n_critics": 1}},
         {"policy_kwargs": {"n_critics": 3, "activation_fn": nn.Tanh, "net_arch": {"pi": [4, 4], "qf": [8]}}},
         {"policy_kwargs": {"share_features_extractor": True}},
-        {"policy_kwargs": {"layer_norm": True}},
         {"learning_rate": lambda remaining: 1e-3 * remaining},
         {"train_freq": (1, "episode"), "gradient_steps": 5},
         {"train_freq": 8, "gradient_steps": 2},

@@ -137,8 +137,6 @@ class EnsembleCritic(BaseModel):
     :param share_features_extractor: whether the features extractor is the actor's, and trained by its loss alone
     :param option_dim: size of what enters beside the features; by default the whole option
     :param n_outputs: Q-values a network
-    :param layer_norm: whether to normalise what goes into each activation function (layer normalisation, without
-        learned scale and shift)
     """
 
     features_extractor: BaseFeaturesExtractor
@@ -156,7 +154,6 @@ class EnsembleCritic(BaseModel):
         share_features_extractor: bool = False,
         option_dim: int | None = None,
         n_outputs: int = 1,
-        layer_norm: bool = False,
     ):
         super().__init__(
             observation_space, action_space, features_extractor=features_extractor, normalize_images=normalize_images
@@ -166,10 +163,7 @@ class EnsembleCritic(BaseModel):
         layers: list[nn.Module] = []
         in_features = features_dim + (action_space.shape[0] if option_dim is None else option_dim)
         for out_features in net_arch:
-            layers.append(EnsembleLinear(n_critics, in_features, out_features))
-            if layer_norm:
-                layers.append(nn.LayerNorm(out_features, elementwise_affine=False))
-            layers.append(activation_fn())
+            layers += [EnsembleLinear(n_critics, in_features, out_features), activation_fn()]
             in_features = out_features
         self.q_networks = nn.Sequential(*layers, EnsembleLinear(n_critics, in_features, n_outputs))
 
@@ -186,14 +180,13 @@ class SoftOptionPolicy(sac_policies.SACPolicy):
 
     Adam runs fused unless ``optimizer_kwargs`` say otherwise.
 
-    :param layer_norm: further, whether the critics have layer normalisation, see :class:`EnsembleCritic`
     :raises ValueError: if gSDE (``use_sde``) is asked for, or less than one critic
     """
 
     actor_class: ClassVar[type[SquashedActor]]
     critic_class: ClassVar[type[EnsembleCritic]]
 
-    def __init__(self, *args: Any, layer_norm: bool = False, **kwargs: Any):
+    def __init__(self, *args: Any, **kwargs: Any):
         if kwargs.get("use_sde"):
             raise ValueError(
                 f"{type(self).__name__} does not support generalized State-Dependent Exploration: remove use_sde=True"
@@ -202,15 +195,11 @@ class SoftOptionPolicy(sac_policies.SACPolicy):
             raise ValueError(f"n_critics must be at least 1, not {kwargs['n_critics']}")
         if kwargs.get("optimizer_class", th.optim.Adam) is th.optim.Adam:
             kwargs["optimizer_kwargs"] = {"fused": True, **(kwargs.get("optimizer_kwargs") or {})}
-        self.layer_norm = layer_norm
         super().__init__(*args, **kwargs)
 
     def _build(self, lr_schedule: Schedule) -> None:
         super()._build(lr_schedule)
         self.critic_target.requires_grad_(False)
-
-    def _get_constructor_parameters(self) -> dict[str, Any]:
-        return {**super()._get_constructor_parameters(), "layer_norm": self.layer_norm}
 
     def set_training_mode(self, mode: bool) -> None:
         """Stable-Baselines3's, which asks for a mode before each decision; most often it is that mode already."""
@@ -225,4 +214,4 @@ class SoftOptionPolicy(sac_policies.SACPolicy):
     def make_critic(self, features_extractor: BaseFeaturesExtractor | None = None) -> Any:
         """An ensemble of critics; with a features extractor of its own unless one is given."""
         kwargs = self._update_features_extractor(self.critic_kwargs, features_extractor)
-        return self.critic_class(**kwargs, layer_norm=self.layer_norm).to(self.device)
+        return self.critic_class(**kwargs).to(self.device)

@@ -29,8 +29,6 @@ aten = th.ops.aten
 #: A layer, and which of its outputs. A list of such is a layer that has these outputs side by side.
 Part = tuple[nn.Module, slice]
 
-_LAYER_NORM_EPS = 1e-5  # nn.LayerNorm's
-
 
 class HandGradients:
     """Updates of a :class:`~sb3_ctco.ctco.ctco.CTCO` without autograd, on copies of its networks' parameters.
@@ -43,15 +41,12 @@ class HandGradients:
     def __init__(self, model: CTCO):
         self._model = model
         self._actors = _PlainActors(model.actor, model.actor_target)
-        self._critics = PlainNetworks(
-            _layers(model.critic.q_networks), _layers(model.critic_target.q_networks), model.policy.layer_norm
-        )
+        self._critics = PlainNetworks(_layers(model.critic.q_networks), _layers(model.critic_target.q_networks))
         self._memory = _memory(model.policy.parameters())
 
     @staticmethod
     def possible_for(model: CTCO) -> bool:
-        """Whether ``model`` has networks of linear layers and rectifiers (critics with layer normalisation or without),
-        and fused Adam that has stepped.
+        """Whether ``model`` has networks of linear layers and rectifiers, and fused Adam that has stepped.
 
         That its losses are CTCO's own is for the caller to know.
         """
@@ -60,10 +55,7 @@ class HandGradients:
         return (
             model.entropy_reference != "duration"  # whose weight is another way to the gradient of d
             and all(type(actor) is OptionActor and _is_plain(actor.latent_pi, nn.Linear) for actor in actors)
-            and all(
-                type(critic) is OptionCritic and _is_plain(critic.q_networks, EnsembleLinear, model.policy.layer_norm)
-                for critic in critics
-            )
+            and all(type(critic) is OptionCritic and _is_plain(critic.q_networks, EnsembleLinear) for critic in critics)
             and all(type(network.features_extractor) is FlattenExtractor for network in actors + critics)
             and all(p.requires_grad for network in (model.actor, model.critic) for p in network.parameters())
             and all(_is_fused_adam(optimizer) for optimizer in optimizers)
@@ -142,12 +134,11 @@ class PlainNetworks:
 
     It works on copies of their parameters, and has the gradients of the ensemble's.
 
-    :param learned: linear layers of the ensemble: ``EnsembleLinear``, or ``nn.Linear`` for an ensemble of one
-    :param targets: linear layers of its targets
-    :param layer_norm: whether what goes into the rectifiers is normalised
+    :param learned: layers of the ensemble: ``EnsembleLinear``, or ``nn.Linear`` for an ensemble of one
+    :param targets: layers of its targets
     """
 
-    def __init__(self, learned: Sequence[Sequence[Part]], targets: Sequence[Sequence[Part]], layer_norm: bool = False):
+    def __init__(self, learned: Sequence[Sequence[Part]], targets: Sequence[Sequence[Part]]):
         #: Parameters, as views, and their copies here.
         self.originals: list[th.Tensor] = []
         self.copies: list[th.Tensor] = []
@@ -165,9 +156,6 @@ class PlainNetworks:
         self._learned_stacks = [stack[: self.n_learned] for stack in self._stacks]
         self._target_stacks = [stack[self.n_learned :] for stack in self._stacks]
         self._activations: list[th.Tensor] = []
-        self._layer_norm = layer_norm
-        #: Of each layer normalisation: its inputs, their means and the reciprocals of their deviations.
-        self._normalised: list[tuple[th.Tensor, th.Tensor, th.Tensor]] = []
 
     def _stack(self, ensembles: Sequence[Sequence[Part]], name: str) -> tuple[th.Tensor, th.Tensor]:
         """Copies of weights or biases of a layer of all members, and what will be the gradient of the learned.
@@ -196,15 +184,10 @@ class PlainNetworks:
     def forward(self, x: th.Tensor) -> th.Tensor:
         """Outputs ``[n_members, batch, out_features]`` of inputs ``[n_members, batch, in_features]``, which are remembered."""
         weights, biases = self._weights[len(x)], self._biases[len(x)]
-        self._activations, self._normalised = [x], []
+        self._activations = [x]
         for i, (weight, bias) in enumerate(zip(weights, biases, strict=True)):
-            if i > 0:
-                if self._layer_norm:
-                    inputs = x
-                    x, mean, reciprocal_std = aten.native_layer_norm(inputs, inputs.shape[2:], None, None, _LAYER_NORM_EPS)
-                    self._normalised.append((inputs, mean, reciprocal_std))
-                self._activations.append(x.relu_())
-            x = affine(x, weight, bias)
+            x = affine(x if i == 0 else x.relu_(), weight, bias)
+            self._activations.append(x)
         return x
 
     def backward(self, gradient: th.Tensor) -> None:
@@ -235,16 +218,9 @@ class PlainNetworks:
         return _times_transposed(gradient, self._weights[self.n_learned][0][:, first:]).sum(dim=0)
 
     def _before_layer(self, gradient: th.Tensor, i: int) -> th.Tensor:
-        """The gradient of the outputs of the linear layer before layer ``i``, from that of the layer's outputs."""
-        n = self.n_learned
-        gradient = _times_transposed(gradient, self._weights[n][i])
-        gradient = aten.threshold_backward(gradient, self._activations[i][:n], 0.0)
-        if self._layer_norm:
-            inputs, mean, reciprocal_std = (of_all[:n] for of_all in self._normalised[i - 1])
-            gradient, _, _ = aten.native_layer_norm_backward(
-                gradient, inputs, inputs.shape[2:], mean, reciprocal_std, None, None, [True, False, False]
-            )
-        return gradient
+        """The gradient of what the rectifier before layer ``i`` was given, from that of the layer's outputs."""
+        gradient = _times_transposed(gradient, self._weights[self.n_learned][i])
+        return aten.threshold_backward(gradient, self._activations[i][: self.n_learned], 0.0)
 
     def update_targets(self, tau: float) -> None:
         """Stable-Baselines3's ``polyak_update``."""
@@ -348,7 +324,7 @@ class _Adam:
 
 
 def _layers(network: nn.Sequential) -> list[list[Part]]:
-    return [[(module, slice(None))] for module in network if not isinstance(module, nn.ReLU | nn.LayerNorm)]
+    return [[(module, slice(None))] for module in network if not isinstance(module, nn.ReLU)]
 
 
 def _rows(parameter: th.Tensor, rows: slice) -> th.Tensor:
@@ -360,10 +336,9 @@ def _times_transposed(gradient: th.Tensor, weight: th.Tensor) -> th.Tensor:
     return gradient * weight.mT if weight.shape[2] == 1 else th.bmm(gradient, weight.mT)
 
 
-def _is_plain(network: nn.Sequential, linear: type[nn.Module], layer_norm: bool = False) -> bool:
-    """Whether linear layers, layer normalisations if there are any, and rectifiers follow each other, in turns."""
-    turns = [linear, nn.LayerNorm, nn.ReLU] if layer_norm else [linear, nn.ReLU]
-    return len(network) > 0 and all(type(module) is turns[i % len(turns)] for i, module in enumerate(network))
+def _is_plain(network: nn.Sequential, linear: type[nn.Module]) -> bool:
+    """Whether linear layers and rectifiers alternate, beginning with a linear layer."""
+    return len(network) > 0 and all(type(module) is (nn.ReLU if i % 2 else linear) for i, module in enumerate(network))
 
 
 def _is_fused_adam(optimizer: th.optim.Optimizer) -> bool:
