@@ -488,7 +488,8 @@ def test_learning_curves_of_a_folder_and_of_a_csv_file(finished, tmp_path, capsy
     for source in (folder, tmp_path / "tiny.csv"):
         assert main(["plot", str(source), "--output", str(tmp_path / "tiny")]) == 0
         assert "learning_curves.png" in capsys.readouterr().out
-    (axes,) = plots.draw_learning_curves(read_curves(folder)).axes
+    points = read_curves(folder)
+    (axes,) = plots.draw_learning_curves(points).axes
     files = sorted(folder.glob("*/monitor.csv"))
     first, second = ([float(row["discounted_return"]) for row in csv.DictReader(file.open())] for file in files)
     line, *others = axes.get_lines()
@@ -497,11 +498,15 @@ def test_learning_curves_of_a_folder_and_of_a_csv_file(finished, tmp_path, capsy
     # Half of ten episodes is the window; a point is the mean over both seeds.
     means = np.mean([[np.mean(one[:5]), np.mean(one[5:])] for one in (first, second)], axis=0)
     np.testing.assert_allclose(line.get_ydata(), means, atol=1e-5)
-    # The band by hand: t(0.975, 1) = 12.706 times half of the seeds' distance
+    assert not axes.collections  # two seeds have no band
+    third = [{**point, "seed": 2, "discounted_return": 0.3} for point in points if point["seed"] == 0]
+    (axes,) = plots.draw_learning_curves([*points, *third]).axes
+    # The band by hand: t(0.975, 2) = 4.303 times s/√3
     band = axes.collections[0].get_paths()[0].vertices[:, 1]
-    half_width = 12.706 * abs(np.mean(first[5:]) - np.mean(second[5:])) / 2
+    last = [np.mean(first[5:]), np.mean(second[5:]), 0.3]
+    half_width = 4.303 * np.std(last, ddof=1) / np.sqrt(3)
     assert half_width > 0
-    for bound in (means[1] - half_width, means[1] + half_width):
+    for bound in (np.mean(last) - half_width, np.mean(last) + half_width):
         assert np.abs(band - bound).min() < 1e-3
 
 

@@ -156,6 +156,8 @@ def draw_interquartile_means(records: Sequence[Record], estimates: dict[str, Est
 def draw_learning_curves(points: Sequence[Record]) -> "Figure":
     """Discounted return of training episodes over task time, mean over seeds: a row a rate, a column a task.
 
+    Intervals are drawn from three seeds on: those of two would hide all else.
+
     :param points: of :func:`~sb3_ctco.study.records.read_curves`
     """
     tasks, lines = tasks_of(points), lines_of(points)
@@ -174,9 +176,10 @@ def draw_learning_curves(points: Sequence[Record]) -> "Figure":
                 minutes = np.array(list(curve)) / 60
                 means, half_widths = np.array([mean_and_interval(one) for one in curve.values()]).reshape(-1, 2).T
                 ax.plot(minutes, means, linewidth=1.2, label=label, **style)
-                ax.fill_between(
-                    minutes, means - half_widths, means + half_widths, color=style["color"], alpha=0.15, linewidth=0
-                )
+                several = np.array([len(one) > 2 for one in curve.values()])
+                if several.any():
+                    low, high = means - half_widths, means + half_widths
+                    ax.fill_between(minutes, low, high, where=several, color=style["color"], alpha=0.15, linewidth=0)
                 shown += means.tolist()
             ax.set_title(f"{TASK_NAMES[task]}, {rate} Hz")
             _return_axis(ax, shown)
@@ -185,7 +188,7 @@ def draw_learning_curves(points: Sequence[Record]) -> "Figure":
         ax.set_xlabel("task time [min]")
     seeds = _seeds(list({key(point): point for point in points}.values()))
     episodes = f"mean of (up to) {CURVE_EPISODES} training episodes"
-    interval = "" if seeds == "1 seed" else f"; mean and 95 % interval (Student's t) of {seeds}"
+    interval = "" if seeds == "1 seed" else f"; mean of {seeds}, 95 % interval (Student's t) of 3 or more"
     _legend(figure, axes[0][0], episodes + interval)
     return figure
 
