@@ -1,7 +1,13 @@
 """Continuous-Time Continuous-Options for Stable-Baselines3: reinforcement learning that decides when to decide."""
 
 from importlib import import_module
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
+
+# An installed package has its wrappers/ and zoo_configs/ inside. A checkout has them beside it: look there as well, because
+# Python started in a clone imports this folder, whatever is installed.
+if not (Path(__file__).parent / "wrappers").is_dir():
+    __path__.append(str(Path(__file__).parents[1]))
 
 from sb3_ctco._version import __version__
 from sb3_ctco.envs import register_envs
