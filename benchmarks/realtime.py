@@ -88,7 +88,7 @@ def main() -> None:
         "late_share": ticks.late_ticks / ticks.ticks,
         "worst_lateness_ms": 1e3 * ticks.worst_lateness,
         "updates_per_second": model._n_updates / seconds,
-        "weights_age_s": percentiles(trainer.weight_ages),
+        "weights_age_s": percentiles(list(trainer.weight_ages)),
         "decision_ms": percentiles([1e3 * value for value in trainer.decision_seconds]),
         "processors": os.cpu_count(),
         "load_average": os.getloadavg()[0],

@@ -3,8 +3,9 @@
 import json
 import math
 import pickle
+import zipfile
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass, fields, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Protocol
 
@@ -81,10 +82,13 @@ class OnnxPolicy:
     Needs onnxruntime, and neither PyTorch nor Stable-Baselines3. Observations are those of the environment: if training
     normalised them, the file does as well. Images come channels first.
 
+    Nothing in the file can run code: it is a graph of numbers, and its metadata are JSON, of which types, ranges and sizes are
+    checked against each other and against the graph.
+
     :param path: the file
     :param n_threads: threads of onnxruntime; more than one seldom pays for networks of this size
     :raises ImportError: without onnxruntime
-    :raises ValueError: if the file was not written by ``export_onnx``
+    :raises ValueError: if the file was not written by ``export_onnx``, or is damaged
     """
 
     def __init__(self, path: str | Path, n_threads: int = 1):
@@ -94,11 +98,21 @@ class OnnxPolicy:
             raise ImportError("running an exported policy needs onnxruntime: pip install 'sb3-ctco[onnx]'") from error
         options = onnxruntime.SessionOptions()
         options.intra_op_num_threads = n_threads
-        self._session = onnxruntime.InferenceSession(str(path), options, providers=["CPUExecutionProvider"])
+        try:
+            self._session = onnxruntime.InferenceSession(str(path), options, providers=["CPUExecutionProvider"])
+        except Exception as error:  # onnxruntime's own, which have no common class
+            raise ValueError(f"{path} is damaged or no ONNX file: {error}") from error
         metadata = self._session.get_modelmeta().custom_metadata_map
         if METADATA_KEY not in metadata:
             raise ValueError(f"{path} does not tell what its options mean: write it with sb3_ctco.export.export_onnx")
-        self.option_settings, self.primitive_action_space, self._observations = _from_metadata(metadata[METADATA_KEY])
+        try:
+            self.option_settings, self.primitive_action_space, self._observations = _from_metadata(metadata[METADATA_KEY])
+            _check_graph(self._session, self.option_settings, self.primitive_action_space, self._observations)
+        except (AttributeError, KeyError, TypeError, ValueError, RecursionError) as error:
+            raise ValueError(
+                f"the metadata of {path} are not those of an exported policy ({type(error).__name__}: {error}): write it anew "
+                "with sb3_ctco.export.export_onnx"
+            ) from None
 
     def __call__(self, observation: Observation) -> np.ndarray:
         """Options for one or several observations.
@@ -135,12 +149,57 @@ def to_metadata(
     )
 
 
+#: Name of a dtype of numbers, as numpy has it, and what ONNX calls it
+_ONNX_TYPES = {
+    "bool": "tensor(bool)",
+    "float16": "tensor(float16)",
+    "float32": "tensor(float)",
+    "float64": "tensor(double)",
+    **{f"{sign}int{bits}": f"tensor({sign}int{bits})" for sign in ("", "u") for bits in (8, 16, 32, 64)},
+}
+
+
 def _from_metadata(text: str) -> tuple[OptionSettings, spaces.Box, dict[str, tuple[tuple[int, ...], str]]]:
+    """The inverse of :func:`to_metadata`, for a text that anybody may have written.
+
+    :raises ValueError: if a value is out of its range, or malformed; likewise KeyError and TypeError
+    """
     data = json.loads(text)
+    settings = data["option_settings"]
+    names = [field.name for field in fields(OptionSettings)]
+    if sorted(settings) != sorted(names) or not all(type(value) in (int, float) for value in settings.values()):
+        raise ValueError(f"option_settings must be the numbers {names}, not {settings}")
+    if data["action_dtype"] not in ("float16", "float32", "float64"):
+        raise ValueError(f"action_dtype must be of floating point, not {data['action_dtype']!r}")
     dtype = np.dtype(data["action_dtype"])
-    box = spaces.Box(np.array(data["action_low"], dtype), np.array(data["action_high"], dtype), dtype=dtype.type)
-    observations = {name: (tuple(shape), kind) for name, (shape, kind) in data["observations"].items()}
-    return OptionSettings(**data["option_settings"]), box, observations
+    low, high = np.array(data["action_low"], dtype), np.array(data["action_high"], dtype)
+    if low.shape != high.shape or low.size == 0 or not (np.isfinite(low).all() and np.isfinite(high).all()):
+        raise ValueError(f"action_low and action_high must be finite and of one shape, not {low} and {high}")
+    if (low > high).any():
+        raise ValueError(f"action_low must not be above action_high: {low} and {high}")
+    observations = {}
+    for name, (shape, kind) in data["observations"].items():
+        if kind not in _ONNX_TYPES or not all(type(n) is int and n > 0 for n in shape):
+            raise ValueError(f"observation {name} must have sizes and a dtype of numbers, not {shape} and {kind!r}")
+        observations[name] = (tuple(shape), kind)
+    return OptionSettings(**settings), spaces.Box(low, high, dtype=dtype.type), observations
+
+
+def _check_graph(
+    session: Any, settings: OptionSettings, action_space: spaces.Box, observations: dict[str, tuple[tuple[int, ...], str]]
+) -> None:
+    """Refuse metadata that do not fit the graph they came with.
+
+    :raises ValueError: if they do not
+    """
+    inputs = {entry.name: (entry.type, tuple(entry.shape[1:])) for entry in session.get_inputs()}
+    expected = {name: (_ONNX_TYPES[kind], shape) for name, (shape, kind) in observations.items()}
+    if inputs != expected:
+        raise ValueError(f"the graph's inputs are {inputs}, the metadata's {expected}")
+    outputs = [(entry.type, *entry.shape[1:]) for entry in session.get_outputs()]
+    option_dim = action_space.low.size * settings.n_rbf + 1
+    if outputs != [("tensor(float)", option_dim)]:
+        raise ValueError(f"the graph's outputs are {outputs}, and options of these settings have {option_dim} numbers")
 
 
 @dataclass(slots=True)
@@ -185,13 +244,16 @@ class OptionController:
         >>> action.shape == env.action_space.shape
         True
 
-    :param policy: a trained model; or the path of one: ``.zip`` as saved by CTCO, or ``.onnx`` as written by
-        :func:`sb3_ctco.export.export_onnx`; or an :class:`OptionPolicy`
+    :param policy: a trained model; or the path of one: ``.zip`` as saved by CTCO or FiGARSAC, or ``.onnx`` as written by
+        :func:`sb3_ctco.export.export_onnx`; or an :class:`OptionPolicy`. To read a ``.zip`` may run code that is in it
     :param dt: time between two ticks, in s; training's by default
-    :param deterministic: whether to act greedily; an exported policy always does
+    :param deterministic: whether to act greedily; for a model, since an :class:`OptionPolicy` and an exported one act their
+        own way
     :param vec_normalize: normalises observations as in training, or the path it was saved to; needed for a path to a
         ``.zip`` only, and only if training normalised observations
-    :raises ValueError: if ``dt`` is not a positive number, or the file is of another kind
+    :raises TypeError: if the model decides by no options
+    :raises ValueError: if ``dt`` is not a positive number, the file is of another kind, or ``deterministic`` or
+        ``vec_normalize`` is given beside a policy that does not take it
     :raises FileNotFoundError: if there is no such file
     """
 
@@ -335,6 +397,11 @@ def _first_leaf(observation: Observation) -> npt.NDArray[Any]:
 def _as_policy(policy: Any, deterministic: bool, vec_normalize: Any) -> OptionPolicy:
     if not isinstance(policy, str | Path):
         if callable(policy):
+            if vec_normalize is not None or not deterministic:
+                raise ValueError(
+                    f"{type(policy).__name__} is a policy that acts and normalises by itself: pass no vec_normalize, "
+                    "deterministic, or pass the model"
+                )
             return policy
         return ModelPolicy(policy, deterministic, _load_vec_normalize(vec_normalize))
     path = Path(policy)
@@ -346,10 +413,34 @@ def _as_policy(policy: Any, deterministic: bool, vec_normalize: Any) -> OptionPo
         return OnnxPolicy(path)
     if path.suffix not in ("", ".zip"):
         raise ValueError(f"{path} must be a model saved as .zip or exported as .onnx")
-    # Imported here, because an exported policy needs none of this; a controller needs no replay buffer.
-    from sb3_ctco.ctco import CTCO  # noqa: PLC0415
+    # A controller needs no replay buffer.
+    model = _algorithm_of(path).load(path, device="cpu", buffer_size=1)
+    return ModelPolicy(model, deterministic, _load_vec_normalize(vec_normalize))
 
-    return ModelPolicy(CTCO.load(path, device="cpu", buffer_size=1), deterministic, _load_vec_normalize(vec_normalize))
+
+def _algorithm_of(path: Path) -> "type[OptionOffPolicyAlgorithm]":
+    """The class that saved a file, by a setting that only it has; nothing of the file is run to find out."""
+    # Imported here, because an exported policy needs none of this.
+    from sb3_ctco.ctco import CTCO  # noqa: PLC0415
+    from sb3_ctco.figar_sac import FiGARSAC  # noqa: PLC0415
+
+    # As Stable-Baselines3 does: the ending may be left out.
+    file = path if path.exists() else path.with_name(f"{path.name}.zip")
+    if not file.exists():
+        raise FileNotFoundError(f"{file} does not exist")
+    try:
+        with zipfile.ZipFile(file) as archive:
+            settings = json.loads(archive.read("data"))
+    except (zipfile.BadZipFile, KeyError, ValueError) as error:
+        raise ValueError(f"{file} is damaged or no model of Stable-Baselines3: {error}") from error
+    if "n_repetitions" in settings:
+        return FiGARSAC
+    if "n_rbf" in settings and "high_freq_penalty" in settings:
+        return CTCO
+    raise TypeError(
+        f"{file} was not saved by CTCO or FiGARSAC: load it with its own class, and pass the model if it decides by options; "
+        "one of fixed rate, such as SAC or DACPPO, has its action from model.predict"
+    )
 
 
 def _load_vec_normalize(vec_normalize: Any) -> Any:

@@ -1,14 +1,18 @@
 """Acting and learning in two processes: what is stored, what comes back, and how it ends."""
 
 import itertools
+import logging
+import math
 import multiprocessing
 import os
-import pickle
+import resource
+import shutil
 import signal
 import subprocess
 import sys
 import textwrap
 import time
+from pathlib import Path
 
 import gymnasium as gym
 import numpy as np
@@ -20,7 +24,8 @@ from stable_baselines3 import PPO, SAC
 from stable_baselines3.common.callbacks import BaseCallback, CheckpointCallback
 
 from sb3_ctco import CTCO, FiGARSAC, OptionExecutionWrapper
-from sb3_ctco.realtime import AsynchronousTrainer, JournalReader, JournalWriter, LearnerError
+from sb3_ctco.realtime import AsynchronousTrainer, JournalError, JournalReader, LearnerError, Transition
+from sb3_ctco.realtime import trainer as trainer_module
 from sb3_ctco.realtime.weights import SharedWeights
 from sb3_ctco.wrappers import RealTimeOptionWrapper
 
@@ -60,31 +65,9 @@ def make_model(algorithm, env, **kwargs):
 
 def records_of(folder):
     reader = JournalReader(folder / "journal")
-    records = reader.read(10**6)
+    records = [Transition.from_arrays(arrays) for arrays in reader.read(10**6)]
     reader.close()
     return records
-
-
-def test_journal_keeps_what_was_written_and_drops_what_was_cut_off(tmp_path):
-    path = tmp_path / "journal"
-    writer = JournalWriter(path)
-    records = [np.arange(k) for k in range(20)]
-    for record in records:
-        writer.add(record)
-    writer.close()
-    reader = JournalReader(path)
-    assert [len(r) for r in reader.read(15)] == list(range(15))
-    assert [len(r) for r in reader.read(15)] == [15, 16, 17, 18, 19]
-    assert reader.read(15) == []
-    with path.open("ab") as file:
-        data = pickle.dumps("lost")
-        file.write(len(data).to_bytes(8, "little") + data[:-3])
-    assert reader.read(1) == [], "an unfinished record waits"
-    writer = JournalWriter(path)
-    writer.add("continued")
-    writer.close()
-    assert reader.read(15) == ["continued"]
-    reader.close()
 
 
 def test_shared_weights_have_a_version_and_arrive_whole():
@@ -99,11 +82,41 @@ def test_shared_weights_have_a_version_and_arrive_whole():
     assert not weights.fetch(target), "these are known"
     weights.publish(source)
     weights.publish(source)
-    with weights._lock:
-        assert not weights.fetch(target), "a reader does not wait"
+    weights._version.value += 1
+    assert not weights.fetch(target), "they are being written, and a reader does not wait"
+    weights._version.value += 1
     assert weights.fetch(target)
-    assert weights.version == 3
     assert 0 <= weights.age < 10
+    weights.publish(source)
+    before = {name: tensor.clone() for name, tensor in target.state_dict().items()}
+    weights._array()[3] ^= 1
+    assert not weights.fetch(target), "what was read is not what was written"
+    assert all(th.equal(tensor, before[name]) for name, tensor in target.state_dict().items())
+
+
+def publish_forever(weights, module):
+    with th.no_grad():
+        for value in itertools.count():
+            for parameter in module.parameters():
+                parameter.fill_(value % 1000)
+            weights.publish(module)
+
+
+def test_weights_are_of_one_version_while_another_process_writes():
+    context = multiprocessing.get_context("spawn")
+    source, target = th.nn.Linear(200, 200), th.nn.Linear(200, 200)
+    weights = SharedWeights(source, context)
+    writer = context.Process(target=publish_forever, args=(weights, source), daemon=True)
+    writer.start()
+    n_fetched, deadline = 0, time.monotonic() + 60
+    while n_fetched < 50 and time.monotonic() < deadline:
+        if weights.fetch(target):
+            n_fetched += 1
+            values = th.cat([parameter.flatten() for parameter in target.parameters()])
+            assert (values == values[0]).all()
+    writer.kill()
+    writer.join()
+    assert n_fetched == 50
 
 
 class Watcher(BaseCallback):
@@ -197,6 +210,93 @@ def test_resume_continues_with_all_that_was_collected(tmp_path):
     assert records[-1].num_timesteps == model.num_timesteps >= steps + 60
     trainer.restore_replay_buffer()
     assert model.replay_buffer.n_decisions == len(records)
+
+
+@pytest.fixture(scope="module")
+def collected(tmp_path_factory):
+    """The folder of a run of CTCO that is over, and how many environment steps it made."""
+    folder = tmp_path_factory.mktemp("collected")
+    env = Point()
+    with AsynchronousTrainer(make_model(CTCO, env), env, folder, real_time=False, updates_per_second=500) as trainer:
+        trainer.learn(100)
+    return folder, trainer.model.num_timesteps
+
+
+@pytest.mark.parametrize(
+    ("algorithm", "changes", "message"),
+    [
+        (CTCO, {"d_max": 0.5}, r"options={.*'d_max': 1.0.*} there, {.*'d_max': 0.5.*} here"),
+        (CTCO, {"gamma": 0.9}, "'discount_rate'"),
+        (CTCO, {"n_rbf": 2}, "'n_rbf': 3.*'n_rbf': 2"),
+        (SAC, {}, "algorithm='CTCO' there, 'SAC' here; options="),
+    ],
+)
+def test_resuming_what_means_something_else_is_refused(collected, algorithm, changes, message):
+    folder, _ = collected
+    env = Point()
+    with pytest.raises(ValueError, match=f"means something else: .*{message}.*begin in another folder"):
+        AsynchronousTrainer(make_model(algorithm, env, **changes), env, folder, resume=True)
+
+
+def test_resuming_after_damage_says_what_was_dropped(collected, tmp_path, caplog):
+    folder = shutil.copytree(collected[0], tmp_path / "run")
+    n = len(records_of(folder))
+    journal = folder / "journal" / "000000.journal"
+    data = bytearray(journal.read_bytes())
+    data[len(data) // 2] ^= 4
+    journal.write_bytes(data)
+    with pytest.raises(JournalError, match="is damaged at byte"):
+        records_of(folder)
+    env = Point()
+    with caplog.at_level(logging.WARNING, logger="sb3_ctco.realtime.journal"):
+        trainer = AsynchronousTrainer(make_model(CTCO, env), env, folder, resume=True)
+    assert trainer.model.num_timesteps == collected[1]
+    assert f"bytes were dropped, {n - 1} records are left" in caplog.text
+    assert (folder / "journal" / "000000.journal.damaged").read_bytes() == data
+    assert len(records_of(folder)) == n - 1
+
+
+def test_resuming_without_a_checkpoint_or_with_a_broken_one(collected, tmp_path, caplog):
+    folder = shutil.copytree(collected[0], tmp_path / "run")
+    data = (folder / "model.zip").read_bytes()
+    env = Point()
+    for broken in (data[: len(data) // 2], b"", data[:200] + b"\0" * 4000 + data[4200:]):
+        (folder / "model.zip").write_bytes(broken)
+        start = time.monotonic()
+        with pytest.raises(ValueError, match=r"model.zip cannot be read.*move the file away"):
+            AsynchronousTrainer(make_model(CTCO, env), env, folder, resume=True)
+        assert time.monotonic() - start < 10
+    (folder / "model.zip").write_bytes(data)
+    with pytest.raises(ValueError, match="was learned with other networks"):
+        AsynchronousTrainer(CTCO("MlpPolicy", env, policy_kwargs={"net_arch": [8]}), env, folder, resume=True)
+    (folder / "model.zip").unlink()
+    with caplog.at_level(logging.WARNING, logger="sb3_ctco.realtime.trainer"):
+        trainer = AsynchronousTrainer(make_model(CTCO, env), env, folder, resume=True)
+    assert "model.zip: learning begins anew, with all that was collected" in caplog.text
+    assert trainer.model.num_timesteps == collected[1]
+
+
+def test_a_start_file_that_is_gone_is_an_error_at_once(tmp_path, monkeypatch):
+    env = Point()
+    trainer = AsynchronousTrainer(make_model(CTCO, env), env, tmp_path)
+    monkeypatch.setattr(trainer.model, "save", lambda path: None, raising=False)
+    start = time.monotonic()
+    with pytest.raises(LearnerError, match=r"start\.zip"):
+        trainer.learn(100)
+    assert time.monotonic() - start < 60
+    assert env.commands == []
+
+
+def test_the_journal_keeps_what_the_replay_buffer_holds(tmp_path):
+    env = Point()
+    model = make_model(CTCO, env, buffer_size=30, n_sub_options=2, d_max=0.2)
+    with AsynchronousTrainer(model, env, tmp_path, real_time=False) as trainer:
+        for steps in (200, 400, 600):
+            trainer.learn(steps)  # each one begins a segment
+        trainer.restore_replay_buffer()
+    assert model.replay_buffer.full
+    assert sum(record.n_rows for record in records_of(tmp_path)) >= 30
+    assert not (tmp_path / "journal" / "000000.journal").exists()
 
 
 def test_sub_options_are_in_the_learners_replay_buffer(tmp_path):
@@ -339,6 +439,258 @@ def test_ctrl_c_stops_both_within_a_second_and_saves(tmp_path, signum):
         os.kill(int(learner), 0)
 
 
+class Stall(BaseCallback):
+    """Stop the learner's process at a step, and let it go on at another one."""
+
+    def __init__(self, first, last):
+        super().__init__()
+        self.first, self.last = first, last
+        self.seconds = 0.0
+
+    def _on_step(self):
+        if self.n_calls == self.first:
+            self.seconds = -time.monotonic()
+            os.kill(multiprocessing.active_children()[0].pid, signal.SIGSTOP)
+        if self.n_calls == self.last:
+            self.seconds += time.monotonic()
+            os.kill(multiprocessing.active_children()[0].pid, signal.SIGCONT)
+        return True
+
+
+def test_acting_goes_on_while_the_learner_stands_still(tmp_path):
+    env = Point()
+    model = make_model(SAC, env)
+    stall = Stall(100, 160)
+    with AsynchronousTrainer(model, env, tmp_path) as trainer:
+        trainer.learn(260, stall)
+        ages = list(trainer.weight_ages)
+    # 60 steps of 0.02 s, and no wait for anybody.
+    assert 1.1 < stall.seconds < 4.0
+    assert max(ages) > 1.0, "with the weights that there were"
+    assert ages[-1] < 1.0, "and then with new ones"
+    records = records_of(tmp_path)
+    assert len(records) == 260
+    assert env.commands[:-1] == [pytest.approx(float(record.action[0, 0])) for record in records], "each one is kept"
+    assert SAC.load(tmp_path / "model.zip").num_timesteps == 260, "and learned from"
+
+
+def test_a_learner_that_stands_still_at_the_end_is_killed(tmp_path, monkeypatch):
+    monkeypatch.setattr(trainer_module, "_STOP_SECONDS", 0.5)
+    env = Point()
+    with (
+        AsynchronousTrainer(make_model(SAC, env), env, tmp_path) as trainer,
+        pytest.raises(LearnerError, match="did not stop within 0 s and was killed"),
+    ):
+        trainer.learn(80, KillLearner(60, signal.SIGSTOP))
+    assert env.commands[-1] == 0.0
+    assert len(env.commands) == 81
+    assert len(records_of(tmp_path)) == 80
+    assert not multiprocessing.active_children()
+
+
+class Blocking(Point):
+    """One step takes 70 ms."""
+
+    def __init__(self):
+        super().__init__()
+        self.times = []
+
+    def step(self, action):
+        self.times.append(time.monotonic())
+        if len(self.times) == 30:
+            time.sleep(0.07)
+        return super().step(action)
+
+
+def test_an_environment_that_blocks_is_late_once_and_nothing_is_made_up_for(tmp_path, caplog):
+    env = Blocking()
+    with (
+        caplog.at_level(logging.WARNING, logger="sb3_ctco.wrappers.real_time"),
+        AsynchronousTrainer(make_model(SAC, env), env, tmp_path) as trainer,
+    ):
+        trainer.learn(49)
+        statistics = trainer.real_time.total_statistics
+    assert statistics.late_ticks >= 1
+    assert statistics.worst_lateness > 0.045
+    assert "ticks were late by more than 1.0 ms" in caplog.text
+    # The command after it comes at once, and the next one a period later.
+    gaps = np.diff(env.times)
+    assert gaps[29] > 0.069
+    assert gaps[30] > 0.015
+    assert len(records_of(tmp_path)) == 49
+
+
+class FillDisk(BaseCallback):
+    """From a step on, files of this process take no more bytes."""
+
+    def __init__(self, at, folder):
+        super().__init__()
+        self.at, self.folder = at, folder
+
+    def _on_step(self):
+        if self.n_calls == self.at:
+            (path,) = (self.folder / "journal").glob("*.journal")
+            hard = resource.getrlimit(resource.RLIMIT_FSIZE)[1]
+            resource.setrlimit(resource.RLIMIT_FSIZE, (path.stat().st_size + 10, hard))
+        return True
+
+
+def test_a_full_disk_stops_the_machine_and_keeps_what_was_written(tmp_path):
+    env = Point()
+    limits = resource.getrlimit(resource.RLIMIT_FSIZE)
+    try:
+        with (
+            AsynchronousTrainer(make_model(SAC, env), env, tmp_path) as trainer,
+            pytest.raises(OSError, match=r"experience cannot be written to .*File too large"),
+        ):
+            trainer.learn(1000, FillDisk(60, tmp_path))
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, limits)
+    assert env.commands[-1] == 0.0
+    assert len(env.commands) < 80
+    n = len(records_of(tmp_path))
+    assert 55 <= n <= 61
+    assert (tmp_path / "model.zip").exists()
+    model = make_model(SAC, env)
+    with AsynchronousTrainer(model, env, tmp_path, resume=True) as trainer:
+        assert model.num_timesteps == n
+        trainer.learn(n + 10)
+    assert len(records_of(tmp_path)) == n + 10
+
+
+class Unsaveable(SAC):
+    """Its checkpoints find no room, but the first file does."""
+
+    def save(self, path, **kwargs):
+        if "unfinished" in str(path):
+            path.write_bytes(b"a part")
+            raise OSError(28, "No space left on device", str(path))
+        super().save(path, **kwargs)
+
+
+def test_a_learner_without_room_for_its_checkpoint_is_reported(tmp_path):
+    env = Point()
+    (tmp_path / "model.zip").write_bytes(b"the one before")
+    with (
+        AsynchronousTrainer(make_model(Unsaveable, env), env, tmp_path, checkpoint_seconds=0.2) as trainer,
+        pytest.raises(LearnerError, match="No space left on device"),
+    ):
+        trainer.learn(1000)
+    assert env.commands[-1] == 0.0
+    assert (tmp_path / "model.zip").read_bytes() == b"the one before"
+    assert not (tmp_path / "model.unfinished.zip").exists()
+
+
+def test_a_folder_that_cannot_be_written_to_is_refused_before_anything_moves(tmp_path):
+    env = Point()
+    (tmp_path / "file").touch()
+    read_only = tmp_path / "read_only"
+    read_only.mkdir(mode=0o500)
+    # Root may write anywhere but to what is no real file system.
+    for folder in (tmp_path / "file" / "run", tmp_path / "file", Path("/proc/run") if os.geteuid() == 0 else read_only):
+        with pytest.raises(OSError, match=f"cannot be kept in {folder}.*that can be written to"):
+            AsynchronousTrainer(make_model(SAC, env), env, folder)
+    assert env.commands == []
+
+
+def test_kill_9_of_acting_leaves_nothing_in_the_system_and_all_in_the_folder(tmp_path):
+    script = tmp_path / "script.py"
+    script.write_text(
+        textwrap.dedent(
+            f"""
+            import multiprocessing, sys
+            sys.path.insert(0, {os.path.dirname(__file__)!r})
+            from test_asynchronous import Point, make_model
+            from sb3_ctco import CTCO
+            from sb3_ctco.realtime import AsynchronousTrainer
+            if __name__ == "__main__":
+                env = Point()
+                trainer = AsynchronousTrainer(make_model(CTCO, env, n_sub_options=0), env, {str(tmp_path / "run")!r})
+                def report(a, b):
+                    print("acting", multiprocessing.active_children()[0].pid, flush=True)
+                    return True
+                trainer.learn(10**6, report)
+            """
+        )
+    )
+    process = subprocess.Popen([sys.executable, str(script)], stdout=subprocess.PIPE, text=True)
+    for _ in range(200):
+        learner = int(process.stdout.readline().split()[1])
+    mapped = {
+        line.split(maxsplit=5)[5].strip()
+        for pid in (process.pid, learner)
+        for line in Path(f"/proc/{pid}/maps").read_text().splitlines()
+        if "/dev/shm" in line
+    }
+    # Memory without a name goes with the last process that has it; a semaphore would have one.
+    assert all(name.endswith("(deleted)") for name in mapped)
+    process.kill()
+    process.wait()
+    deadline = time.monotonic() + 60
+    while Path(f"/proc/{learner}").exists() and time.monotonic() < deadline:
+        time.sleep(0.05)
+    assert not Path(f"/proc/{learner}").exists(), "the learner saves and ends"
+    assert CTCO.load(tmp_path / "run" / "model.zip")._n_updates > 0
+    env = Point()
+    model = make_model(CTCO, env, n_sub_options=0)
+    AsynchronousTrainer(model, env, tmp_path / "run", resume=True)
+    assert model.num_timesteps >= 150, "what is in flight may be lost, which is one option of at most 50 steps"
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ({"updates_per_second": 0}, "updates_per_second must be a positive number or None, not 0"),
+        ({"updates_per_second": math.nan}, "updates_per_second must be a positive number or None, not nan"),
+        ({"updates_per_second": math.inf}, "updates_per_second must be a positive number or None, not inf"),
+        ({"updates_per_second": "20"}, "updates_per_second must be a positive number or None, not '20'"),
+        ({"learner_threads": 0}, "learner_threads must be a whole number from 1 or None, not 0"),
+        ({"learner_threads": 1.5}, "learner_threads must be a whole number from 1 or None, not 1.5"),
+        ({"learner_niceness": -1}, "learner_niceness must be a whole number from 0 to 19, not -1"),
+        ({"learner_niceness": 20}, "learner_niceness must be a whole number from 0 to 19, not 20"),
+        ({"learner_niceness": 1.5}, "learner_niceness must be a whole number from 0 to 19, not 1.5"),
+        ({"learner_niceness": True}, "learner_niceness must be a whole number from 0 to 19, not True"),
+        ({"learner_niceness": None}, "learner_niceness must be a whole number from 0 to 19, not None"),
+        ({"acting_priority": 100}, "acting_priority must be None or, on Linux, a whole number from 1 to 99, not 100"),
+        ({"checkpoint_seconds": -1}, "checkpoint_seconds must be a positive number of seconds, not -1"),
+        ({"checkpoint_seconds": 0.0}, "checkpoint_seconds must be a positive number of seconds, not 0.0"),
+        ({"checkpoint_seconds": math.nan}, "checkpoint_seconds must be a positive number of seconds, not nan"),
+        ({"decide_ahead": -0.1}, "decide_ahead must be a finite number of seconds from 0, not -0.1"),
+        ({"decide_ahead": math.nan}, "decide_ahead must be a finite number of seconds from 0, not nan"),
+        ({"decide_ahead": math.inf}, "decide_ahead must be a finite number of seconds from 0, not inf"),
+        ({"decide_ahead": 1.0}, r"decide_ahead must be at least 0 s and less than d_max=1.0 s, not 1.0"),
+        ({"safe_stop": None}, "safe_stop must be a function of the bare environment, not None"),
+        ({"safe_stop": 0.0}, "safe_stop must be a function of the bare environment, not 0.0"),
+        ({"interrupt": 0.1}, "interrupt must be a function or None, not 0.1"),
+        ({"learner_device": "abacus"}, "learner_device='abacus' is no device of torch"),
+    ],
+)
+def test_bad_arguments_are_refused_before_anything_is_made(tmp_path, arguments, message):
+    env = Point()
+    with pytest.raises((ValueError, TypeError), match=message):
+        AsynchronousTrainer(make_model(CTCO, env), env, tmp_path / "run", **arguments)
+    assert env.commands == []
+    assert not (tmp_path / "run" / "journal").exists()
+
+
+@pytest.mark.parametrize("total_timesteps", [-1, 1.5, math.nan, None, True])
+def test_a_total_that_is_no_number_of_steps_is_refused(tmp_path, total_timesteps):
+    env = Point()
+    trainer = AsynchronousTrainer(make_model(SAC, env), env, tmp_path)
+    with pytest.raises(ValueError, match=f"total_timesteps must be a whole number of steps from 0, not {total_timesteps}"):
+        trainer.learn(total_timesteps)
+    assert trainer.learn(0) is trainer.model
+    assert not (tmp_path / "journal").exists()
+
+
+def test_statistics_of_decisions_do_not_grow_for_ever(tmp_path, monkeypatch):
+    monkeypatch.setattr(trainer_module, "_MAX_KEPT", 30)
+    env = Point()
+    with AsynchronousTrainer(make_model(SAC, env), env, tmp_path, real_time=False) as trainer:
+        trainer.learn(40)
+    assert len(trainer.decision_seconds) == len(trainer.weight_ages) == 30
+
+
 def test_refusals(tmp_path):
     env = Point()
     with pytest.raises(ValueError, match="off-policy algorithm such as CTCO or SAC, not PPO"):
@@ -350,8 +702,6 @@ def test_refusals(tmp_path):
         AsynchronousTrainer(model, model.get_env(), tmp_path)
     with pytest.raises(ValueError, match="options, which SAC is not"):
         AsynchronousTrainer(model, env, tmp_path, decide_ahead=0.1)
-    with pytest.raises(ValueError, match="updates_per_second must be positive or None, not 0"):
-        AsynchronousTrainer(model, env, tmp_path, updates_per_second=0)
 
 
 # Options decided ahead, and interrupted

@@ -12,7 +12,7 @@ from gymnasium import spaces
 from stable_baselines3 import SAC
 from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 
-from sb3_ctco import CTCO, OptionController, OptionExecutionWrapper
+from sb3_ctco import CTCO, DACPPO, FiGARSAC, OptionController, OptionExecutionWrapper
 from sb3_ctco.controller import OnnxPolicy
 from sb3_ctco.export import export_onnx
 from sb3_ctco.options import OptionSettings
@@ -301,10 +301,25 @@ def test_exported_policy_of_other_observations(tmp_path, kind):
         np.testing.assert_allclose(policy(obs), model.predict(obs, deterministic=True)[0], atol=1e-5)
 
 
+@pytest.fixture(scope="module")
+def exported(tmp_path_factory):
+    """The file of an exported policy with three basis functions."""
+    path = tmp_path_factory.mktemp("exported") / "model.onnx"
+    export_onnx(CTCO("MlpPolicy", "Pendulum-v1", n_rbf=3, buffer_size=10, seed=0), path)
+    return path
+
+
+# It unpickles nothing, either: Python tells of every class that a pickle asks for.
 RUN_WITHOUT_TORCH = """
 import json, sys
 import numpy as np
 from sb3_ctco import OptionController
+
+def refuse(event, arguments):
+    if event == "pickle.find_class":
+        raise SystemExit(f"it unpickled {arguments}")
+
+sys.addaudithook(refuse)
 controller = OptionController(sys.argv[1])
 actions = [controller(np.array(obs, np.float32)).tolist() for obs in json.loads(sys.argv[2])]
 loaded = [name for name in ("torch", "stable_baselines3") if name in sys.modules]
@@ -320,6 +335,34 @@ def test_exported_policy_runs_without_torch(tmp_path, pendulum_model):
     assert result["loaded"] == []
     controller = OptionController(pendulum_model)
     np.testing.assert_allclose(result["actions"], [controller(obs) for obs in observations], atol=1e-4)
+
+
+def test_from_a_file_of_figar_sac(tmp_path):
+    model = FiGARSAC("MlpPolicy", "Pendulum-v1", n_repetitions=7, seed=3)
+    model.save(tmp_path / "model")
+    from_file, from_model = OptionController(tmp_path / "model"), OptionController(model)
+    for obs in np.random.default_rng(0).normal(size=(30, 3)).astype(np.float32):
+        np.testing.assert_array_equal(from_file(obs), from_model(obs))
+        assert from_file.duration == from_model.duration
+
+
+def test_files_of_models_without_options_are_refused(tmp_path):
+    DACPPO("MlpPolicy", "Pendulum-v1").save(tmp_path / "dac_ppo")
+    SAC("MlpPolicy", "Pendulum-v1", buffer_size=10).save(tmp_path / "sac")
+    for name in ("dac_ppo", "sac.zip"):
+        with pytest.raises(TypeError, match=f"{name[:3]}.*zip was not saved by CTCO or FiGARSAC.*model.predict"):
+            OptionController(tmp_path / name)
+    with pytest.raises(FileNotFoundError, match=r"model\.zip does not exist"):
+        OptionController(tmp_path / "model")
+    (tmp_path / "model.zip").write_bytes((tmp_path / "sac.zip").read_bytes()[:3000])
+    with pytest.raises(ValueError, match=r"model\.zip is damaged or no model of Stable-Baselines3"):
+        OptionController(tmp_path / "model.zip")
+
+
+@pytest.mark.parametrize("given", [{"deterministic": False}, {"vec_normalize": "vecnormalize.pkl"}])
+def test_a_policy_takes_nothing_that_is_a_models(given):
+    with pytest.raises(ValueError, match="ScriptedPolicy is a policy that acts and normalises by itself"):
+        OptionController(ScriptedPolicy((0.0, 0.0, 0.2)), **given)
 
 
 def test_errors_say_what_to_do(tmp_path, pendulum_model):
@@ -364,6 +407,60 @@ def test_files_that_are_no_exported_policies(tmp_path, pendulum_model):
     del file.metadata_props[:]
     onnx.save(file, path)
     with pytest.raises(ValueError, match="export_onnx"):
+        OptionController(path)
+
+
+def with_metadata(source, target, change):
+    """A copy of an exported policy whose metadata somebody changed."""
+    onnx = pytest.importorskip("onnx")
+    file = onnx.load(source)
+    (entry,) = file.metadata_props
+    data = json.loads(entry.value)
+    entry.value = json.dumps(change(data) or data)
+    onnx.save(file, target)
+    return target
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (lambda data: data["option_settings"].update(n_rbf=10**9), "the graph's outputs are"),
+        (lambda data: data["option_settings"].update(n_rbf=2), "the graph's outputs are .* have 3 numbers"),
+        (lambda data: data["option_settings"].update(n_rbf="3"), "option_settings must be the numbers"),
+        (lambda data: data["option_settings"].update(dt=float("nan")), "dt must be a positive number"),
+        (lambda data: data["option_settings"].update(d_max=True), "option_settings must be the numbers"),
+        (lambda data: data["option_settings"].update(other=1.0), "option_settings must be the numbers"),
+        (lambda data: data["option_settings"].pop("dt"), "option_settings must be the numbers"),
+        (lambda data: data.update(option_settings=[1]), "option_settings must be the numbers"),
+        (lambda data: data.update(observations=[1]), "AttributeError"),
+        (lambda data: data.update(action_dtype="O"), "action_dtype must be of floating point, not 'O'"),
+        (lambda data: data.update(action_low=[float("-inf")]), "must be finite and of one shape"),
+        (lambda data: data.update(action_low=[3.0]), "action_low must not be above action_high"),
+        (lambda data: data.update(action_low=["a"]), "ValueError"),
+        (lambda data: data.update(action_low=[-2.0] * 2, action_high=[2.0] * 2), "the graph's outputs are"),
+        (lambda data: data["observations"].update(observation=[[4], "float32"]), "the graph's inputs are"),
+        (lambda data: data["observations"].update(observation=[[3], "float64"]), "the graph's inputs are"),
+        (lambda data: data["observations"].update(observation=[[-3], "float32"]), "must have sizes and a dtype"),
+        (lambda data: data["observations"].update(observation=[[3], "O"]), "must have sizes and a dtype"),
+        (lambda data: data["observations"].update(more=[[3], "float32"]), "the graph's inputs are"),
+        (lambda data: data.pop("observations"), "KeyError"),
+        (lambda data: [data], "TypeError"),
+    ],
+)
+def test_metadata_that_somebody_changed(exported, tmp_path, change, message):
+    def changed(data):
+        result = change(data)
+        return result if isinstance(result, list) and isinstance(result[0], dict) else None
+
+    path = with_metadata(exported, tmp_path / "model.onnx", changed)
+    with pytest.raises(ValueError, match=f"the metadata of .* are not those of an exported policy.*({message})"):
+        OptionController(path)
+
+
+def test_an_exported_policy_that_is_damaged(exported, tmp_path):
+    path = tmp_path / "model.onnx"
+    path.write_bytes(exported.read_bytes()[:500])
+    with pytest.raises(ValueError, match=r"model\.onnx is damaged or no ONNX file"):
         OptionController(path)
 
 

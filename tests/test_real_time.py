@@ -98,6 +98,33 @@ def test_lost_periods_are_not_made_up_for():
     assert (env.statistics.late_ticks, env.statistics.worst_lateness) == (1, 0.75)
 
 
+@pytest.mark.parametrize("jump", [-3600.0, -0.125, 3600.0])
+@pytest.mark.parametrize("robot", [False, True])
+def test_a_clock_that_jumps_costs_a_period_at_most(jump, robot):
+    """Commands stay a period apart by time that passes, and nobody waits for an hour."""
+    clock = FakeClock()
+    env = RealTimeWrapper((Robot if robot else Simulation)(clock), clock=clock)
+    env.reset()
+    for k in range(6):
+        if k == 3:
+            clock.time += jump
+        env.step(np.zeros(1))
+    assert all(0 < seconds <= 0.25 for seconds in clock.slept)
+    gaps = np.diff(env.unwrapped.commands)
+    np.testing.assert_allclose(gaps, [0.25, 0.25, 0.25 + jump, 0.25, 0.25])
+    assert sum(clock.slept) == pytest.approx(6 * 0.25)
+    assert env.statistics.late_ticks == (1 if jump > 0 else 0)
+
+
+def test_a_clock_that_is_set_back_while_waiting():
+    clock = FakeClock()
+    env = RealTimeWrapper(Simulation(clock, [0.0, -3600.0, 0.0, 0.0]), clock=clock)
+    env.reset()
+    for _ in range(4):
+        env.step(np.zeros(1))
+    assert clock.slept == [0.25] * 4
+
+
 def test_tolerance():
     clock = FakeClock()
     env = RealTimeWrapper(Simulation(clock), clock=clock, tolerance=0.0625)

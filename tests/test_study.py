@@ -19,7 +19,7 @@ import pytest
 import yaml
 from rliable.metrics import aggregate_iqm
 
-from sb3_ctco.study import agents, plots, runs, status
+from sb3_ctco.study import agents, engines, plots, runs, status
 from sb3_ctco.study.cli import main
 from sb3_ctco.study.grid import Run, load_preset, preset_names
 from sb3_ctco.study.records import COLUMNS, collect, paper_returns, read_curves, read_records
@@ -153,6 +153,33 @@ def test_mistakes_in_a_preset(tmp_path, changes, message):
         load_preset(tiny(tmp_path, **changes))
 
 
+@pytest.mark.parametrize("setting", ["../../../outside", "/tmp/outside", "a/b", "a\\b", "..", "a\0b", "", "a\nb", "naïve"])
+def test_a_setting_cannot_leave_the_studys_folder(tmp_path, setting, capsys):
+    entry = yaml.safe_load(Path(tiny(tmp_path)).read_text())["algorithms"]["ctco"]
+    preset = tiny(tmp_path, algorithms={"ctco": {**entry, "setting": setting}}, tasks=["point_mass"])
+    folder = tmp_path / "inner" / "study"
+    before = set(tmp_path.rglob("*"))
+    if setting in ("", ".."):
+        # Between other parts of a name these are harmless.
+        runs.plan(load_preset(preset).runs, folder)
+        assert {path.parent for path in folder.iterdir()} == {folder}
+        return
+    assert main(["run", "--preset", preset, "--folder", str(folder)]) == 1
+    assert f"setting {setting!r} of ctco would make the folder" in capsys.readouterr().err
+    assert set(tmp_path.rglob("*")) == before
+    (run, *_) = load_preset(preset).runs
+    with pytest.raises(ValueError, match="must consist of letters"):
+        runs.perform(run, folder)
+
+
+def test_a_preset_is_data_only(tmp_path):
+    file = tmp_path / "evil.yml"
+    file.write_text(f"task_seconds: !!python/object/apply:os.mkdir ['{tmp_path}/made']\n")
+    with pytest.raises(Exception, match="could not determine a constructor"):
+        load_preset(str(file))
+    assert not (tmp_path / "made").exists()
+
+
 def test_mistakes_on_the_command_line(tmp_path, capsys):
     preset = tiny(tmp_path, algorithms={"ctco": {"setting": "a", "arguments": {"gama": 0.9}}})
     for arguments, message in [
@@ -280,17 +307,68 @@ def test_two_studies_at_once_make_each_run_once(tmp_path):
 def test_kill_9_loses_only_the_runs_in_flight(tmp_path):
     preset, folder = tiny(tmp_path, seeds=6), tmp_path / "study"
     arguments = ["run", "--preset", preset, "--folder", str(folder), "--workers", "2"]
+    shared = set(os.listdir("/dev/shm"))
     study = subprocess.Popen([*COMMAND, *arguments], stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
     wait_for(lambda: len(list(folder.glob("*/record.json"))) >= 2)
+    worker = worker_at_work(study.pid, folder)
     study.send_signal(signal.SIGKILL)
     study.wait()
-    # Its workers see at the end of an episode that nobody waits for them.
-    wait_for(lambda: not any(runs.is_running(path) for path in folder.iterdir()), 30)
+    # Its workers end with it, whatever they are at.
+    wait_for(lambda: worker not in processes() or not open_files(worker), 10)
+    assert not any(runs.is_running(path) for path in folder.iterdir())
+    # Of other processes there may be some that began meanwhile; joblib, loky, multiprocessing and torch have names.
+    left = [name for name in set(os.listdir("/dev/shm")) - shared if "loky" in name or "joblib" in name]
+    assert not left
     done = {file: file.stat().st_mtime_ns for file in folder.glob("*/record.json")}
     assert 2 <= len(done) < 6
     assert main(arguments) == 0
     assert len(list(folder.glob("*/record.json"))) == 6
     assert {file: file.stat().st_mtime_ns for file in done} == done
+
+
+def test_a_study_shares_no_memory_and_no_semaphores(tmp_path):
+    """So that none can be left behind, however all of its processes end."""
+    preset, folder = tiny(tmp_path, seeds=1), tmp_path / "study"
+    arguments = [*COMMAND, "run", "--preset", preset, "--folder", str(folder), "--workers", "2"]
+    study = subprocess.Popen(arguments, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+    worker = worker_at_work(study.pid, folder)
+    used = {path for pid in (study.pid, worker) for path in mapped_files(pid) | open_files(pid) if "/dev/shm" in path}
+    assert study.wait(timeout=120) == 0
+    assert used == set()
+
+
+def test_a_run_of_another_study_is_tried_again_at_the_end(finished, tmp_path, capsys):
+    """For that study may have been killed meanwhile."""
+    preset, original = finished
+    folder = tmp_path / "study"
+    shutil.copytree(original, folder)
+    first, second = sorted(folder.iterdir())
+    for path in (first, second):
+        (path / "record.json").unlink()
+    outcomes = engines.run_local(load_preset(preset).runs, folder, 1)
+    with runs.lock(first) as locked:
+        assert locked
+        assert next(outcomes) == runs.Outcome(second.name, "done")
+    assert next(outcomes) == runs.Outcome(first.name, "done")
+    assert list(outcomes) == []
+
+
+def test_a_run_whose_process_always_dies_fails(finished, tmp_path, monkeypatch):
+    preset, original = finished
+    folder = tmp_path / "study"
+    shutil.copytree(original, folder)
+    (run, *_) = load_preset(preset).runs
+    (folder / run.name / "record.json").unlink()
+    monkeypatch.setattr(engines, "_work", dies)
+    (outcome,) = engines.run_local([run], folder, 1)
+    assert outcome.state == "failed"
+    assert "process died 4 times, at last with exit code 7" in outcome.message
+    assert "exit code 7" in (folder / run.name / "error.txt").read_text()
+
+
+def dies(connection, folder):
+    connection.recv()
+    os._exit(7)
 
 
 def test_a_worker_that_dies_is_replaced(tmp_path):
@@ -331,6 +409,10 @@ def worker_at_work(study_pid: int, folder: Path) -> int:
 
 def processes() -> list[int]:
     return [int(path.name) for path in Path("/proc").iterdir() if path.name.isdigit()]
+
+
+def mapped_files(pid: int) -> set[str]:
+    return {line.split()[-1] for line in Path(f"/proc/{pid}/maps").read_text().splitlines()}
 
 
 def open_files(pid: int) -> set[str]:

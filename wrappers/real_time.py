@@ -81,8 +81,9 @@ class RealTimeWrapper(gym.Wrapper, RecordConstructorArgs):
 
     A command is late if whoever decides, or the machine, took too long. Late ticks are counted in ``statistics`` (of
     this episode) and ``total_statistics``, shown as ``info["real_time"]`` (``lateness`` of this step's command in s)
-    and logged as one warning an episode. The following commands keep their times, unless a whole period was lost:
-    then the clock starts anew, because commands in quick succession do a machine no good.
+    and logged as one warning an episode. The following commands keep their times, unless a whole period was lost or the
+    clock was set back: then it starts anew, because commands in quick succession do a machine no good, and to wait until the
+    old time comes again no better.
 
     :param env: the environment
     :param dt: the period, in s; by default what :func:`~sb3_ctco.wrappers.find_dt` finds
@@ -125,7 +126,8 @@ class RealTimeWrapper(gym.Wrapper, RecordConstructorArgs):
     def step(self, action: Any) -> tuple[Any, SupportsFloat, bool, bool, dict[str, Any]]:
         """Send a command and return what is observed one period later."""
         now = self.clock.now()
-        if self._due is None:
+        # Before its time, without a wait that returned early: the clock was set back, and there is no telling how far.
+        if self._due is None or now < self._due - self.tolerance:
             self._due, lateness = now, 0.0
         else:
             lateness = max(0.0, now - self._due)
@@ -153,7 +155,8 @@ class RealTimeWrapper(gym.Wrapper, RecordConstructorArgs):
         assert self._due is not None
         remaining = self._due - self.clock.now()
         if remaining > 0:
-            self.clock.sleep(remaining)
+            # A clock that was set back must not stop the machine for as long.
+            self.clock.sleep(min(remaining, self.dt))
 
     def _log(self) -> None:
         s = self.statistics

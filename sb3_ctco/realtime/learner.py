@@ -1,5 +1,7 @@
 """The learning process: reads experience from the journal, updates, publishes weights."""
 
+import contextlib
+import dataclasses
 import multiprocessing
 import os
 import signal
@@ -8,7 +10,6 @@ import time
 import traceback
 from dataclasses import dataclass
 from multiprocessing.connection import Connection
-from multiprocessing.synchronize import Event
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -17,8 +18,9 @@ import torch as th
 from stable_baselines3.common.logger import Logger
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 
-from sb3_ctco.realtime.journal import JournalReader
+from sb3_ctco.realtime.journal import Arrays, JournalError, JournalReader
 from sb3_ctco.realtime.weights import SharedWeights
+from sb3_ctco.wrappers import SubOptions
 
 #: An update's share of a round is kept below this, so that a round can be stopped in time; in s
 _ROUND_SECONDS = 0.1
@@ -39,6 +41,42 @@ class Transition(NamedTuple):
     done: np.ndarray
     infos: list[dict[str, Any]]
     num_timesteps: int
+
+    def to_arrays(self) -> Arrays:
+        """As a record of the journal, with what a replay buffer uses of the one environment's info."""
+        (info,) = self.infos
+        kept = {name: info[name] for name in ("TimeLimit.truncated", "option") if name in info}
+        if "sub_options" in info:
+            kept["sub_options"] = _fields(info["sub_options"])
+        return {**self._asdict(), "infos": kept}
+
+    @classmethod
+    def from_arrays(cls, arrays: Arrays) -> "Transition":
+        """The transition that a record holds.
+
+        :raises JournalError: if it is another kind of record
+        """
+        try:
+            info = dict(arrays["infos"]) if "infos" in arrays else {}
+            if "TimeLimit.truncated" in info:
+                info["TimeLimit.truncated"] = bool(info["TimeLimit.truncated"])
+            if "option" in info:
+                info["option"] = {name: value.item() for name, value in info["option"].items()}
+            if "sub_options" in info:
+                info["sub_options"] = SubOptions(**info["sub_options"])
+            return cls(**{**arrays, "infos": [info], "num_timesteps": int(arrays["num_timesteps"])})
+        except (KeyError, TypeError, ValueError, AttributeError) as error:
+            raise JournalError(f"a record of the journal is no transition: {type(error).__name__}: {error}") from None
+
+    @property
+    def n_rows(self) -> int:
+        """Rows of a replay buffer that it fills."""
+        return 1 + len(self.infos[0].get("sub_options", ()))
+
+
+def _fields(instance: Any) -> dict[str, Any]:
+    # Not dataclasses.asdict, which would copy every array.
+    return {field.name: getattr(instance, field.name) for field in dataclasses.fields(instance)}
 
 
 @dataclass(frozen=True)
@@ -73,8 +111,8 @@ def acting_module(model: OffPolicyAlgorithm) -> th.nn.Module:
     return actor if isinstance(actor, th.nn.Module) else model.policy
 
 
-def run_learner(settings: LearnerSettings, weights: SharedWeights, stop: Event, report: Connection) -> None:
-    """Learn until told to stop or left alone, then save. Runs in a process of its own.
+def run_learner(settings: LearnerSettings, weights: SharedWeights, stop: Any, report: Connection) -> None:
+    """Learn until ``stop.value`` is true or the acting process is gone, then save. Runs in a process of its own.
 
     What it reports is ``("ready", None)``, ``("log", {name: value})`` and ``("failed", traceback)``.
     """
@@ -89,16 +127,15 @@ def run_learner(settings: LearnerSettings, weights: SharedWeights, stop: Event, 
         report.send(("failed", traceback.format_exc()))
         raise SystemExit(1) from None
     exit_code = 0
-    try:
-        report.send(("ready", None))
-        learner.run()
-    except (BrokenPipeError, ConnectionResetError):
-        pass  # the acting process is gone
-    except Exception:
-        exit_code = 1
-        report.send(("failed", traceback.format_exc()))
-    finally:
-        learner.save()
+    for work in (learner.run, learner.save):
+        try:
+            work()
+        except (BrokenPipeError, ConnectionResetError):
+            pass  # the acting process is gone
+        except Exception:
+            exit_code = 1
+            with contextlib.suppress(BrokenPipeError, ConnectionResetError):
+                report.send(("failed", traceback.format_exc()))
     # Everything is on disk. The interpreter would take another second to clear its memory, and the acting process waits.
     sys.stdout.flush()
     sys.stderr.flush()
@@ -106,7 +143,7 @@ def run_learner(settings: LearnerSettings, weights: SharedWeights, stop: Event, 
 
 
 class _Learner:
-    def __init__(self, settings: LearnerSettings, weights: SharedWeights, stop: Event, report: Connection):
+    def __init__(self, settings: LearnerSettings, weights: SharedWeights, stop: Any, report: Connection):
         self.settings = settings
         self.weights = weights
         self.stop = stop
@@ -119,6 +156,7 @@ class _Learner:
 
     def run(self) -> None:
         """Alternate between reading what was collected and a short round of updates."""
+        self.report.send(("ready", None))
         parent = multiprocessing.parent_process()
         assert parent is not None
         model, settings = self.model, self.settings
@@ -127,7 +165,7 @@ class _Learner:
         started: float | None = None
         logged_at = saved_at = time.monotonic()
         updates_logged = 0
-        while not self.stop.is_set() and parent.is_alive():
+        while not self.stop.value and parent.is_alive():
             n_read = fill_replay_buffer(model, self.journal, 1000)
             if n_read == 1000:
                 continue  # learning waits until all that was collected before is read
@@ -158,8 +196,12 @@ class _Learner:
     def save(self) -> None:
         """Write a checkpoint, in one move."""
         unfinished = self.settings.folder / "model.unfinished.zip"
-        self.model.save(unfinished)
-        os.replace(unfinished, self.settings.folder / "model.zip")
+        try:
+            self.model.save(unfinished)
+            os.replace(unfinished, self.settings.folder / "model.zip")
+        finally:
+            # On a full disk it would take the room of what comes after it.
+            unfinished.unlink(missing_ok=True)
 
 
 def fill_replay_buffer(model: OffPolicyAlgorithm, journal: JournalReader, max_records: int) -> int:
@@ -168,8 +210,9 @@ def fill_replay_buffer(model: OffPolicyAlgorithm, journal: JournalReader, max_re
     :return: how many
     """
     assert model.replay_buffer is not None
-    records: list[Transition] = journal.read(max_records)
+    records = journal.read(max_records)
     for record in records:
-        model.replay_buffer.add(*record[:-1])  # type: ignore[arg-type]
-        model.num_timesteps = record.num_timesteps
+        transition = Transition.from_arrays(record)
+        model.replay_buffer.add(*transition[:-1])  # type: ignore[arg-type]
+        model.num_timesteps = transition.num_timesteps
     return len(records)

@@ -1,28 +1,36 @@
 """The acting process: keeps the clock, never waits for the learner, and leaves the machine in a safe state."""
 
+import ctypes
+import logging
+import math
 import multiprocessing
 import os
 import signal
 import sys
+import tempfile
 import threading
 import time
+from collections import deque
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any, Generic, TypeVar
 
 import gymnasium as gym
 import numpy as np
 import torch as th
+from gymnasium import spaces
 from gymnasium.error import ResetNeeded
 from stable_baselines3 import HerReplayBuffer
 from stable_baselines3.common.callbacks import BaseCallback, CallbackList, ConvertCallback
 from stable_baselines3.common.env_util import unwrap_wrapper
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.type_aliases import MaybeCallback
+from stable_baselines3.common.utils import get_device
 
 from sb3_ctco.common.option_algorithm import OptionOffPolicyAlgorithm
-from sb3_ctco.realtime.journal import JournalReader, JournalWriter
+from sb3_ctco.realtime.journal import JournalReader, JournalWriter, check_meaning, repair_journal, segments
 from sb3_ctco.realtime.learner import (
     LearnerError,
     LearnerSettings,
@@ -40,6 +48,8 @@ from sb3_ctco.wrappers import (
     SupportsSendReceive,
 )
 
+logger = logging.getLogger(__name__)
+
 SafeStop = Callable[[gym.Env], None]
 AlgorithmType = TypeVar("AlgorithmType", bound=OffPolicyAlgorithm)
 
@@ -47,6 +57,8 @@ AlgorithmType = TypeVar("AlgorithmType", bound=OffPolicyAlgorithm)
 _START_SECONDS = 120.0
 #: How long it may take to stop and save before it is killed, in s
 _STOP_SECONDS = 60.0
+#: How many decisions times are kept of
+_MAX_KEPT = 100_000
 
 
 def send_zero(env: gym.Env) -> None:
@@ -70,10 +82,10 @@ class AsynchronousTrainer(Generic[AlgorithmType]):
 
     Acting keeps the period of the environment by the wall clock and never waits for the learner. Every transition is
     written to ``folder/journal``, from which the learner fills its replay buffer: whatever was collected survives the
-    end of either process. Weights come back through shared memory, with a version, and are picked up between two
-    decisions. Callbacks, the logger and the progress bar are those of ``model.learn``; the model that they see has the
-    weights in use, but critics and optimizers only once learning is over. ``folder/model.zip`` is the learner's
-    checkpoint, with all of them.
+    end of either process, and is deleted only when as much that is newer fills the replay buffer. Weights come back
+    through shared memory, with a version, and are picked up between two decisions. Callbacks, the logger and the progress
+    bar are those of ``model.learn``; the model that they see has the weights in use, but critics and optimizers only once
+    learning is over. ``folder/model.zip`` is the learner's checkpoint, with all of them.
 
     However learning ends (Ctrl-C, SIGTERM, an exception on either side, a learner that was killed), the last command is
     the safe one; then the learner ends its round of updates (0.1 s, or one update), saves and stops. A script that uses
@@ -89,7 +101,9 @@ class AsynchronousTrainer(Generic[AlgorithmType]):
     :param env: the bare environment; it must tell its period, or be wrapped in
         :class:`~sb3_ctco.wrappers.RealTimeWrapper` already
     :param folder: for the journal and the checkpoints
-    :param resume: continue what is in ``folder``; without it, an existing journal is an error
+    :param resume: continue what is in ``folder``; without it, an existing journal is an error. What was damaged, by a
+        machine that lost its power for instance, is dropped with a warning, and kept as a copy. ``model.zip`` is a file of
+        Stable-Baselines3, and to read it may run code that is in it: resume only what is yours
     :param real_time: whether to hold the wall-clock period; False plays a simulation as fast as it goes
     :param safe_stop: called with the bare environment to leave the machine in a safe state; by default it commands zero
     :param updates_per_second: at most so many updates; None for as many as the learner's processor can do
@@ -98,12 +112,15 @@ class AsynchronousTrainer(Generic[AlgorithmType]):
     :param learner_niceness: how much less urgent learning is to the operating system than acting
     :param acting_priority: priority of the acting thread under Linux's real-time scheduler (SCHED_FIFO, 1 to 99), which no
         ordinary process delays; needs root or CAP_SYS_NICE. None leaves it to the ordinary scheduler
-    :param checkpoint_seconds: between two checkpoints of the learner
+    :param checkpoint_seconds: between two checkpoints of the learner; ``math.inf`` for one at the end alone
     :param decide_ahead: decide on the next option this many seconds before the current one ends, see
         :class:`~sb3_ctco.wrappers.RealTimeOptionWrapper`; for algorithms with options. With this or ``interrupt`` there are
         no sub-options: the model's ``n_sub_options`` becomes 0
     :param interrupt: ends an option early, see there; for algorithms with options
-    :raises ValueError: for an environment, a model or settings that cannot be right
+    :raises ValueError: for an environment, a model or settings that cannot be right, and for ``resume`` if what is in
+        ``folder`` was collected with other settings or cannot be read
+    :raises TypeError: if ``safe_stop`` or ``interrupt`` is no function
+    :raises OSError: if ``folder`` cannot be written to
     :raises FileExistsError: if ``folder`` holds a journal and ``resume`` is not asked for
     """
 
@@ -124,34 +141,29 @@ class AsynchronousTrainer(Generic[AlgorithmType]):
         decide_ahead: float = 0.0,
         interrupt: Interrupt | None = None,
     ):
-        if not isinstance(model, OffPolicyAlgorithm):
-            raise ValueError(
-                f"AsynchronousTrainer needs an off-policy algorithm such as CTCO or SAC, not {type(model).__name__}"
-            )
-        if not isinstance(env, gym.Env) or unwrap_wrapper(env, OptionExecutionWrapper) is not None:
-            raise ValueError(
-                f"pass one bare Gymnasium environment, not {env}: AsynchronousTrainer wraps it itself, with the settings of "
-                "the model"
-            )
-        if model.replay_buffer_class is not None and issubclass(model.replay_buffer_class, HerReplayBuffer):
-            raise ValueError(
-                "HerReplayBuffer is not supported: it computes rewards with the environment, which the learner has not"
-            )
-        if updates_per_second is not None and not updates_per_second > 0:
-            raise ValueError(f"updates_per_second must be positive or None, not {updates_per_second}")
-        if acting_priority is not None and not (hasattr(os, "sched_setscheduler") and 1 <= acting_priority <= 99):
-            raise ValueError(f"acting_priority must be None or, on Linux, from 1 to 99, not {acting_priority}")
+        _check_model_and_env(model, env)
+        _check_functions(safe_stop=safe_stop, interrupt=interrupt)
+        _check_numbers(
+            updates_per_second=updates_per_second,
+            learner_threads=learner_threads,
+            learner_niceness=learner_niceness,
+            acting_priority=acting_priority,
+            checkpoint_seconds=checkpoint_seconds,
+            decide_ahead=decide_ahead,
+        )
+        _check_device(learner_device)
         reactive = decide_ahead > 0 or interrupt is not None
         if reactive and not isinstance(model, OptionOffPolicyAlgorithm):
             raise ValueError(
                 f"decide_ahead and interrupt are for algorithms with options, which {type(model).__name__} is not"
             )
         self.folder = Path(folder)
-        if (self.folder / "journal").exists() and not resume:
+        self._journal_folder = self.folder / "journal"
+        if self._journal_folder.exists() and not resume:
             raise FileExistsError(
                 f"{self.folder} holds the experience of an earlier run: pass resume=True to continue it, or another folder"
             )
-        self.folder.mkdir(parents=True, exist_ok=True)
+        _check_folder(self.folder)
         self.model = model
         self.bare_env = env.unwrapped
         self.safe_stop = safe_stop
@@ -180,11 +192,13 @@ class AsynchronousTrainer(Generic[AlgorithmType]):
             "updates_per_second": updates_per_second,
             "checkpoint_seconds": checkpoint_seconds,
         }
-        #: Seconds that each decision took the policy, the latest last
-        self.decision_seconds: list[float] = []
-        #: Age in s of the weights that each decision was made with
-        self.weight_ages: list[float] = []
+        #: Seconds that each of the latest 100,000 decisions took the policy, the latest last
+        self.decision_seconds: deque[float] = deque(maxlen=_MAX_KEPT)
+        #: Age in s of the weights that each of them was made with
+        self.weight_ages: deque[float] = deque(maxlen=_MAX_KEPT)
         if resume:
+            check_meaning(self._journal_folder, _meaning(model))
+            repair_journal(self._journal_folder)
             self._load_checkpoint()
             self._count_timesteps()
 
@@ -205,17 +219,22 @@ class AsynchronousTrainer(Generic[AlgorithmType]):
         """Act until ``total_timesteps`` environment steps have been made in all, what was resumed included.
 
         :return: the model, with everything that the learner learned
+        :raises ValueError: if ``total_timesteps`` is negative
         :raises LearnerError: if the learner failed or was killed
+        :raises OSError: if what was collected cannot be written
         """
+        _check_numbers(total_timesteps=total_timesteps)
         model = self.model
         remaining = total_timesteps - model.num_timesteps
         if remaining <= 0:
             return model
         context = multiprocessing.get_context("spawn")
         weights = SharedWeights(acting_module(model), context)
-        stop = context.Event()
+        stop = context.RawValue(ctypes.c_bool, False)
         report, learner_end = context.Pipe(duplex=False)
-        journal = JournalWriter(self.folder / "journal")
+        assert model.replay_buffer is not None
+        # What a replay buffer of this size has forgotten, no other one would learn from.
+        journal = JournalWriter(self._journal_folder, _meaning(model), keep=model.replay_buffer.buffer_size)
         start = self.folder / "start.zip"
         model.save(start)
         settings = LearnerSettings(type(model), start, self.folder, total_timesteps, **self._settings)
@@ -223,12 +242,7 @@ class AsynchronousTrainer(Generic[AlgorithmType]):
         process.start()
         learner_end.close()
         link = _Link(process, report, weights, model)
-        own = _AsynchronousCallback(self, link)
-        callbacks: list[BaseCallback] = [own]
-        if isinstance(callback, list):
-            callbacks += callback
-        elif callback is not None:
-            callbacks.append(callback if isinstance(callback, BaseCallback) else ConvertCallback(callback))
+        callbacks = CallbackList([_AsynchronousCallback(self, link), *_as_list(callback)])
         replay_buffer = model.replay_buffer
         try:
             with _sigterm_as_exit():
@@ -242,7 +256,7 @@ class AsynchronousTrainer(Generic[AlgorithmType]):
                 with _prompt_threads(), _scheduled(self.acting_priority):
                     model.learn(
                         remaining,
-                        CallbackList(callbacks),
+                        callbacks,
                         log_interval=log_interval,
                         tb_log_name=tb_log_name,
                         reset_num_timesteps=model.num_timesteps == 0,
@@ -259,7 +273,7 @@ class AsynchronousTrainer(Generic[AlgorithmType]):
                 try:
                     journal.close()
                 finally:
-                    stop.set()
+                    stop.value = True
                     link.join()
         link.raise_if_failed()
         self._load_checkpoint()
@@ -267,7 +281,7 @@ class AsynchronousTrainer(Generic[AlgorithmType]):
 
     def restore_replay_buffer(self) -> None:
         """Fill the model's own replay buffer with everything that was collected, for instance to learn on in place."""
-        journal = JournalReader(self.folder / "journal")
+        journal = JournalReader(self._journal_folder)
         while fill_replay_buffer(self.model, journal, 1000):
             pass
         journal.close()
@@ -282,10 +296,18 @@ class AsynchronousTrainer(Generic[AlgorithmType]):
     def _load_checkpoint(self) -> None:
         path = self.folder / "model.zip"
         if not path.exists():
+            if segments(self._journal_folder):
+                logger.warning("there is no %s: learning begins anew, with all that was collected", path)
             return
         model = self.model
-        learned = type(model).load(path, device=model.device)
-        model.set_parameters(learned.get_parameters(), device=model.device)  # type: ignore[arg-type]
+        try:
+            learned = type(model).load(path, device=model.device)
+            model.set_parameters(learned.get_parameters(), device=model.device)  # type: ignore[arg-type]
+        except Exception as error:  # a damaged file fails in as many ways as it has parts
+            raise ValueError(
+                f"{path} cannot be read, or was learned with other networks ({type(error).__name__}: {error}): pass the "
+                "arguments of that model, or move the file away to learn anew from what was collected"
+            ) from error
         for name in model._get_torch_save_params()[1]:
             # A temperature may be fixed, and then be None in some algorithms.
             if isinstance(getattr(model, name), th.Tensor):
@@ -293,12 +315,11 @@ class AsynchronousTrainer(Generic[AlgorithmType]):
         model._n_updates = learned._n_updates
 
     def _count_timesteps(self) -> None:
-        path = self.folder / "journal"
-        if not path.exists():
+        if not segments(self._journal_folder):
             return
-        journal = JournalReader(path)
+        journal = JournalReader(self._journal_folder)
         while records := journal.read(1000):
-            self.model.num_timesteps = records[-1].num_timesteps
+            self.model.num_timesteps = Transition.from_arrays(records[-1]).num_timesteps
         journal.close()
 
     def _timed(self, sample_action: Callable[..., Any], weights: SharedWeights) -> Callable[..., Any]:
@@ -310,6 +331,78 @@ class AsynchronousTrainer(Generic[AlgorithmType]):
             return result
 
         return timed
+
+
+def _check_model_and_env(model: Any, env: Any) -> None:
+    if not isinstance(model, OffPolicyAlgorithm):
+        raise ValueError(f"AsynchronousTrainer needs an off-policy algorithm such as CTCO or SAC, not {type(model).__name__}")
+    if not isinstance(env, gym.Env) or unwrap_wrapper(env, OptionExecutionWrapper) is not None:
+        raise ValueError(
+            f"pass one bare Gymnasium environment, not {env}: AsynchronousTrainer wraps it itself, with the settings of "
+            "the model"
+        )
+    if model.replay_buffer_class is not None and issubclass(model.replay_buffer_class, HerReplayBuffer):
+        raise ValueError(
+            "HerReplayBuffer is not supported: it computes rewards with the environment, which the learner has not"
+        )
+
+
+def _check_functions(safe_stop: Any, interrupt: Any) -> None:
+    if not callable(safe_stop):
+        raise TypeError(f"safe_stop must be a function of the bare environment, not {safe_stop!r}: it leaves the machine safe")
+    if not (interrupt is None or callable(interrupt)):
+        raise TypeError(f"interrupt must be a function or None, not {interrupt!r}")
+
+
+#: Of each number: its type, whether None is allowed, its range, and that in words
+_NUMBERS: dict[str, tuple[type, bool, Callable[[Any], bool], str]] = {
+    "total_timesteps": (int, False, lambda n: n >= 0, "a whole number of steps from 0"),
+    "updates_per_second": (float, True, lambda x: 0 < x < math.inf, "a positive number or None"),
+    "learner_threads": (int, True, lambda n: n >= 1, "a whole number from 1 or None"),
+    "learner_niceness": (int, False, lambda n: 0 <= n <= 19, "a whole number from 0 to 19"),
+    "acting_priority": (
+        int,
+        True,
+        lambda n: hasattr(os, "sched_setscheduler") and 1 <= n <= 99,
+        "None or, on Linux, a whole number from 1 to 99",
+    ),
+    "checkpoint_seconds": (float, False, lambda x: x > 0, "a positive number of seconds"),
+    "decide_ahead": (float, False, lambda x: 0 <= x < math.inf, "a finite number of seconds from 0"),
+}
+
+
+def _check_numbers(**numbers: Any) -> None:
+    """Refuse numbers that are none, are out of their range, or are NaN, which fails every comparison."""
+    for name, value in numbers.items():
+        kind, optional, is_allowed, allowed = _NUMBERS[name]
+        if value is None and optional:
+            continue
+        kinds = (int, np.integer) if kind is int else (int, float, np.integer, np.floating)
+        if isinstance(value, bool) or not isinstance(value, kinds) or not is_allowed(value):
+            raise ValueError(f"{name} must be {allowed}, not {value!r}")
+
+
+def _check_device(device: Any) -> None:
+    try:
+        get_device(device)
+    except (RuntimeError, TypeError) as error:
+        raise ValueError(f"learner_device={device!r} is no device of torch, such as 'cpu' or 'cuda': {error}") from error
+
+
+def _check_folder(folder: Path) -> None:
+    """Make a folder, and refuse one that cannot be written to, before anything moves."""
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        with tempfile.TemporaryFile(dir=folder):
+            pass
+    except OSError as error:
+        raise OSError(f"experience cannot be kept in {folder} ({error}): pass a folder that can be written to") from error
+
+
+def _as_list(callback: MaybeCallback) -> list[BaseCallback]:
+    if callback is None or isinstance(callback, list):
+        return callback or []
+    return [callback if isinstance(callback, BaseCallback) else ConvertCallback(callback)]
 
 
 def _learned_elsewhere(gradient_steps: int, batch_size: int = 64) -> None:
@@ -339,10 +432,23 @@ class _JournalBuffer:
         self._model = model
 
     def add(self, obs: Any, next_obs: Any, action: Any, reward: Any, done: Any, infos: list[dict[str, Any]]) -> None:
-        used = ("TimeLimit.truncated", "option", "sub_options")
-        kept: list[dict[str, Any]] = [{key: info[key] for key in used if key in info} for info in infos]
         # Stable-Baselines3 hands over arrays of its own, except for the observations, which the next step writes over.
-        self._journal.add(Transition(_copy(obs), _copy(next_obs), action, reward, done, kept, self._model.num_timesteps))
+        transition = Transition(_copy(obs), _copy(next_obs), action, reward, done, infos, self._model.num_timesteps)
+        self._journal.add(transition.to_arrays(), transition.n_rows)
+
+
+def _meaning(model: OffPolicyAlgorithm) -> dict[str, Any]:
+    """What a model's transitions mean, by which another one may or may not learn from them."""
+    is_option = isinstance(model, OptionOffPolicyAlgorithm)
+    space = model.observation_space
+    leaves = space.spaces if isinstance(space, spaces.Dict) else {"": space}
+    actions: Any = model.primitive_action_space if is_option else model.action_space
+    return {
+        "algorithm": type(model).__name__,
+        "options": asdict(model.option_settings) if is_option else None,
+        "actions": {"low": actions.low.tolist(), "high": actions.high.tolist()},
+        "observations": {name: [list(leaf.shape or ()), str(leaf.dtype)] for name, leaf in leaves.items()},
+    }
 
 
 def _copy(obs: np.ndarray | dict[str, np.ndarray]) -> np.ndarray | dict[str, np.ndarray]:
@@ -402,7 +508,7 @@ class _Link:
         if kind == "log":
             self.log = content
         elif kind == "failed":
-            self._failure = f"the learner failed:\n{content}"
+            self._failure = self._failure or f"the learner failed:\n{content}"
         return str(kind)
 
 

@@ -1,43 +1,109 @@
-"""Where runs are made: in worker processes of this machine (joblib), or on Ray."""
+"""Where runs are made: in worker processes of this machine, or on Ray."""
 
+import contextlib
 import logging
+import multiprocessing
 import os
+import threading
+from collections import Counter, deque
 from collections.abc import Iterator, Sequence
+from multiprocessing.connection import Connection, wait
+from multiprocessing.process import BaseProcess
 from pathlib import Path
 
 from sb3_ctco.study.grid import Run
-from sb3_ctco.study.runs import RECORD, Outcome, perform, record_failure
+from sb3_ctco.study.runs import Outcome, perform, record_failure
 
 #: How often a run begins again whose process died
 RETRIES = 3
 
+#: What libraries read, once, to know how many threads to have
+_THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMEXPR_NUM_THREADS", "VECLIB_MAXIMUM_THREADS")
+
 
 def run_local(runs: Sequence[Run], folder: Path, workers: int) -> Iterator[Outcome]:
     """Make runs in processes of this machine, one a worker with one thread.
+
+    They are connected by pipes alone, so that no semaphore and no shared memory outlives a study that was killed, and they
+    end at once when it does. A run whose process died begins again; one that another study is at is tried once more at the
+    end, because that study may have been killed meanwhile.
 
     :param runs: the runs, planned in the folder
     :param folder: the study's
     :param workers: number of processes
     :return: what became of each run, in the order in which they end
     """
-    import joblib  # noqa: PLC0415
-    from joblib.externals.loky.process_executor import TerminatedWorkerError  # noqa: PLC0415
-
-    left = {run.name: run for run in runs}
-    for attempt in range(RETRIES + 1):
-        with joblib.parallel_config(backend="loky", inner_max_num_threads=1):
-            parallel = joblib.Parallel(n_jobs=workers, batch_size=1, return_as="generator_unordered")
-            try:
-                for outcome in parallel(joblib.delayed(perform)(run, folder, os.getpid()) for run in list(left.values())):
-                    del left[outcome.name]
+    waiting, deaths, seen_busy = deque(runs), Counter[str](), set[str]()
+    at_work: dict[Connection, tuple[BaseProcess, Run]] = {}
+    idle: list[tuple[Connection, BaseProcess]] = []
+    try:
+        while waiting or at_work:
+            while waiting and len(at_work) < workers:
+                connection, process = idle.pop() if idle else _start_worker(folder)
+                at_work[connection] = process, waiting.popleft()
+                with contextlib.suppress(BrokenPipeError):  # it has died, as is found below
+                    connection.send(at_work[connection][1])
+            for connection in wait(list(at_work)):
+                assert isinstance(connection, Connection)
+                process, run = at_work.pop(connection)
+                try:
+                    outcome: Outcome = connection.recv()
+                except (EOFError, ConnectionResetError):
+                    # For lack of memory, for instance.
+                    connection.close()
+                    process.join()
+                    deaths[run.name] += 1
+                    if deaths[run.name] <= RETRIES:
+                        waiting.append(run)
+                    else:
+                        how = f"the run's process died {RETRIES + 1} times, at last with exit code {process.exitcode}"
+                        yield record_failure(run, folder, RuntimeError(how))
+                    continue
+                idle.append((connection, process))
+                if outcome.state == "busy" and run.name not in seen_busy:
+                    seen_busy.add(run.name)
+                    waiting.append(run)
+                else:
                     yield outcome
-                return
-            except TerminatedWorkerError as error:
-                # One process died, of a lack of memory for instance, and took the others with it.
-                left = {name: run for name, run in left.items() if not (folder / name / RECORD).exists()}
-                if attempt == RETRIES:
-                    for run in left.values():
-                        yield record_failure(run, folder, error)
+    finally:
+        for process, _ in at_work.values():
+            process.terminate()
+        for connection, process in [*idle, *((connection, process) for connection, (process, _) in at_work.items())]:
+            connection.close()
+            process.join()
+
+
+def _start_worker(folder: Path) -> tuple[Connection, BaseProcess]:
+    context = multiprocessing.get_context("spawn")
+    connection, end_of_worker = context.Pipe()
+    process = context.Process(target=_work, args=(end_of_worker, folder), daemon=True)
+    before = {name: os.environ.get(name) for name in _THREADS}
+    os.environ.update(dict.fromkeys(_THREADS, "1"))
+    try:
+        process.start()
+    finally:
+        for name, value in before.items():
+            if value is None:
+                del os.environ[name]
+            else:
+                os.environ[name] = value
+    end_of_worker.close()
+    return connection, process
+
+
+def _work(connection: Connection, folder: Path) -> None:
+    threading.Thread(target=_end_with_the_study, daemon=True).start()
+    # Until the study closes its end, or somebody presses Ctrl-C, which reaches every process of the terminal.
+    with contextlib.suppress(EOFError, KeyboardInterrupt):
+        while True:
+            connection.send(perform(connection.recv(), folder))
+
+
+def _end_with_the_study() -> None:
+    study = multiprocessing.parent_process()
+    assert study is not None
+    study.join()
+    os._exit(1)  # Nobody waits for this run any more. The next study begins it again.
 
 
 def run_on_ray(runs: Sequence[Run], folder: Path, workers: int, address: str | None) -> Iterator[Outcome]:

@@ -6,6 +6,7 @@ import fcntl
 import json
 import os
 import platform
+import re
 import subprocess
 import time
 import traceback
@@ -27,6 +28,8 @@ SETTINGS, VERSIONS, RECORD, ERROR, LOCK = "settings.json", "versions.json", "rec
 MONITOR, EVALUATION = "monitor.csv", "evaluation.csv"
 MONITOR_COLUMNS = ("task_seconds", "discounted_return", "decision_rate_hz", "wall_seconds")
 EVALUATION_COLUMNS = ("discounted_return", "decision_rate_hz")
+#: What is a folder's name on every operating system, and inside the folder that it is put in
+_NAME = re.compile(r"[A-Za-z0-9_][A-Za-z0-9_.+-]*")
 _PACKAGES = ("sb3-ctco", "stable-baselines3", "torch", "numpy", "gymnasium", "mujoco", "dm-control")
 
 
@@ -47,15 +50,28 @@ class Outcome:
 def plan(runs: Sequence[Run], folder: Path) -> None:
     """Make the runs' folders, each with its settings.
 
-    :raises ValueError: if a folder has other settings
+    :raises ValueError: if a folder has other settings, or a run's name is none of a folder
     """
     for run in runs:
-        file = folder / run.name / SETTINGS
+        file = folder_of(run, folder) / SETTINGS
         if file.exists():
             _refuse_other_settings(run, json.loads(file.read_text()), file)
         else:
             file.parent.mkdir(parents=True, exist_ok=True)
             write_whole(file, json.dumps(run.as_dict(), indent=1) + "\n")
+
+
+def folder_of(run: Run, folder: str | Path) -> Path:
+    """A run's folder, which is always directly in the study's.
+
+    :raises ValueError: if the run's name, of which parts stand in preset files, is none of a folder
+    """
+    if not _NAME.fullmatch(run.name):
+        raise ValueError(
+            f"setting {run.setting!r} of {run.algorithm} would make the folder {run.name!r}: a setting's name must consist of "
+            "letters of the Latin alphabet, digits and the signs _ . + -"
+        )
+    return Path(folder) / run.name
 
 
 def _refuse_other_settings(run: Run, found: dict[str, Any], file: Path) -> None:
@@ -72,16 +88,15 @@ def _refuse_other_settings(run: Run, found: dict[str, Any], file: Path) -> None:
         )
 
 
-def perform(run: Run, folder: str | Path, study_pid: int | None = None) -> Outcome:
+def perform(run: Run, folder: str | Path) -> Outcome:
     """Make a run, unless it is complete or another study is at it.
 
     What a run that was interrupted has left is written anew.
 
     :param run: the run, planned in the folder
     :param folder: the study's
-    :param study_pid: the process that wants the result; without it, if this is another one, the run ends
     """
-    path = Path(folder) / run.name
+    path = folder_of(run, folder)
     with lock(path) as locked:
         if not locked:
             return Outcome(run.name, "busy")
@@ -89,15 +104,16 @@ def perform(run: Run, folder: str | Path, study_pid: int | None = None) -> Outco
             return Outcome(run.name, "done")
         (path / ERROR).unlink(missing_ok=True)
         try:
-            _train(run, path, study_pid)
+            _train(run, path)
         except Exception as error:
             return record_failure(run, folder, error)
         return Outcome(run.name, "done")
 
 
 def record_failure(run: Run, folder: str | Path, error: Exception) -> Outcome:
-    """Write an error and its traceback into a run's folder."""
-    write_whole(Path(folder) / run.name / ERROR, "".join(traceback.format_exception(error)))
+    """Write an error and its traceback into a run's folder, if the disk takes them."""
+    with contextlib.suppress(OSError):
+        write_whole(folder_of(run, folder) / ERROR, "".join(traceback.format_exception(error)))
     return Outcome(run.name, "failed", f"{type(error).__name__}: {error}")
 
 
@@ -135,9 +151,9 @@ def is_running(path: Path) -> bool:
 class _Monitor(DiscountedReturnCallback):
     """Writes each training episode to a CSV file as it ends."""
 
-    def __init__(self, run: Run, file: Path, study_pid: int | None):
+    def __init__(self, run: Run, file: Path):
         super().__init__(discount_rate(run))
-        self.run, self.file, self.study_pid = run, file, study_pid
+        self.run, self.file = run, file
 
     def _on_training_start(self) -> None:
         super()._on_training_start()
@@ -152,8 +168,6 @@ class _Monitor(DiscountedReturnCallback):
             row = (timestep * self.run.dt, episode.discounted_return, episode.decision_rate_hz, wall_seconds)
             with self.file.open("a", newline="") as file:
                 csv.writer(file).writerow([_short(value) for value in row])
-            if self.study_pid is not None and self.study_pid not in (os.getpid(), os.getppid()):
-                os._exit(1)  # Nobody waits for this run any more. The next study begins it again.
         return proceed
 
     def last_tenth(self) -> list[EpisodeStatistics]:
@@ -162,12 +176,12 @@ class _Monitor(DiscountedReturnCallback):
         return [e for e, n in zip(self.episodes, self.timesteps, strict=True) if n * self.run.dt > beginning]
 
 
-def _train(run: Run, path: Path, study_pid: int | None) -> None:
+def _train(run: Run, path: Path) -> None:
     th.set_num_threads(1)  # Several runs share the cores.
     commit, versions = git_commit(), package_versions()
     write_whole(path / VERSIONS, json.dumps({"commit": commit, **versions}, indent=1) + "\n")
     model = make_model(run)
-    monitor = _Monitor(run, path / MONITOR, study_pid)
+    monitor = _Monitor(run, path / MONITOR)
     start = time.monotonic()
     model.learn(round(run.task_seconds * run.rate), monitor)
     wall_seconds = time.monotonic() - start
