@@ -72,7 +72,7 @@ class ModelPolicy:
         """Options for one or several observations."""
         if self.vec_normalize is not None:
             observation = self.vec_normalize.normalize_obs(observation)
-        return self.model.predict(observation, deterministic=self.deterministic)[0]
+        return np.asarray(self.model.predict(observation, deterministic=self.deterministic)[0])
 
 
 class OnnxPolicy:

@@ -275,7 +275,7 @@ def test_exported_policy_is_the_policy(tmp_path, pendulum_model):
     observations = np.random.default_rng(0).normal(size=(100, 3)).astype(np.float32)
     expected = pendulum_model.predict(observations, deterministic=True)[0]
     np.testing.assert_allclose(policy(observations), expected, atol=1e-5)
-    np.testing.assert_allclose(policy(observations[0]), expected[0], atol=1e-5)
+    np.testing.assert_allclose(policy(observations[0]), expected[0].vector, atol=1e-5)
 
 
 @pytest.mark.parametrize("kind", ["dict", "image"])

@@ -718,7 +718,7 @@ def test_greedy_options_are_the_means(random_walk_env):
     obs = np.array([[0.3, 0.1]], dtype=np.float32)
     mean = model.actor.distribution_parameters(th.as_tensor(obs))[0][0].detach().numpy()
     expected = np.append(np.tanh(mean[:-1]), 2 / (1 + math.exp(-mean[-1])) - 1)
-    np.testing.assert_allclose(model.predict(obs, deterministic=True)[0][0], expected, rtol=1e-5)
+    np.testing.assert_allclose(model.predict(obs, deterministic=True)[0][0].vector, expected, rtol=1e-5)
     assert not np.allclose(model.predict(obs)[0], model.predict(obs)[0])
 
 

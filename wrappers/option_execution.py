@@ -18,6 +18,7 @@ from gymnasium.utils import RecordConstructorArgs
 from gymnasium.wrappers import OrderEnforcing, PassiveEnvChecker
 from stable_baselines3.common.monitor import Monitor
 
+from sb3_ctco.option_array import plain
 from sb3_ctco.options import (
     DEFAULT_DISCOUNT_RATE,
     REWARD_UNITS,
@@ -269,9 +270,10 @@ class OptionExecutionWrapper(gym.Wrapper, RecordConstructorArgs):
         :raises ValueError: if the option has another shape or is not finite, or if the environment returned a reward
             or an observation that is not finite
         """
-        option = np.asarray(action, dtype=np.float64).ravel()
+        given = np.asarray(plain(action), dtype=np.float64)
+        option = given.ravel()
         if option.shape != self.action_space.shape:
-            raise ValueError(f"an option here has shape {self.action_space.shape} (ω, then d), not {np.shape(action)}")
+            raise ValueError(f"an option here has shape {self.action_space.shape} (ω, then d), not {given.shape}")
         if not np.isfinite(option).all():
             raise ValueError(f"an option must be finite, not {option}")
         if self._play is None:
@@ -326,13 +328,13 @@ class OptionExecutionWrapper(gym.Wrapper, RecordConstructorArgs):
             self.n_sub_options = n_sub_options
             self._play = None
 
-    def plan(self, option: np.ndarray) -> np.ndarray:
+    def plan(self, option: npt.ArrayLike) -> np.ndarray:
         """All primitive actions of an option, in the inner environment's units.
 
         :param option: shape ``[action_dim · n_rbf + 1]``
         :return: shape ``[n_steps, *action_shape]``
         """
-        omega, n_steps = self.option_settings.decode(np.clip(option, -1.0, 1.0))
+        omega, n_steps = self.option_settings.decode(np.clip(plain(option), -1.0, 1.0))
         return self._box.actions(action_plan(omega, n_steps))
 
     def _draw_slices(self, n_steps: int) -> list[tuple[int, int]]:

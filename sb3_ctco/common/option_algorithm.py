@@ -3,6 +3,7 @@
 import dataclasses
 import io
 import pathlib
+import warnings
 from typing import Any, TypeVar
 
 import gymnasium as gym
@@ -26,17 +27,20 @@ from stable_baselines3.common.type_aliases import (
     TrainFrequencyUnit,
 )
 from stable_baselines3.common.vec_env import (
+    DummyVecEnv,
     VecEnv,
     VecEnvWrapper,
     VecFrameStack,
+    VecMonitor,
     VecTransposeImage,
     unwrap_vec_normalize,
     unwrap_vec_wrapper,
 )
 
 from sb3_ctco.common.buffers import DictOptionReplayBuffer, OptionReplayBuffer
-from sb3_ctco.common.callbacks import OptionProgressBarCallback, PrimitiveStepCallback
+from sb3_ctco.common.callbacks import OptionProgressBarCallback, PrimitiveStepCallback, eval_callbacks
 from sb3_ctco.common.vec_env import PLAYED, AsyncOptionVecEnv
+from sb3_ctco.option_array import OptionArray
 from sb3_ctco.options import OptionSettings, discount_rate_from_gamma
 from sb3_ctco.wrappers import OptionExecutionWrapper, SubOptions, find_dt
 
@@ -177,15 +181,34 @@ class OptionOffPolicyAlgorithm(OffPolicyAlgorithm):
             if not all(env.env_is_wrapped(OptionExecutionWrapper)):
                 raise ValueError(
                     f"{type(self).__name__} cannot wrap the environments of a VecEnv from outside: make it with "
-                    "make_vec_env(..., wrapper_class=OptionExecutionWrapper, wrapper_kwargs=dict(n_rbf=..., d_max=...))"
+                    "make_vec_env(..., wrapper_class=OptionExecutionWrapper, wrapper_kwargs=dict(n_rbf=..., d_max=...)). "
+                    "With RL Zoo, the command sb3-ctco in the place of python -m rl_zoo3 does so"
                 )
+            _warn_of_outer_monitors(env)
             return env
+        _warn_of_outer_monitors(env)
         wrapped = unwrap_wrapper(env, OptionExecutionWrapper)
         if wrapped is None:
             return self.wrap_env(env, self.n_sub_options)
         if unwrap_wrapper(env, Monitor) is None:
             # Inside, where it counts primitive steps; Stable-Baselines3 would put it outside.
             wrapped.env = Monitor(wrapped.env)  # type: ignore[attr-defined]
+        return env
+
+    def _as_eval_env(self, env: VecEnv) -> VecEnv:
+        """The environment of an EvalCallback, which made a ``DummyVecEnv`` of the one that it was given."""
+        if not all(env.env_is_wrapped(OptionExecutionWrapper)):
+            if type(env) is not DummyVecEnv:
+                raise ValueError(
+                    f"EvalCallback evaluates in a {type(env).__name__} of environments that do not play options: pass it "
+                    "model.wrap_env(env), or make it with make_vec_env(..., wrapper_class=OptionExecutionWrapper, "
+                    "wrapper_kwargs=dict(n_rbf=..., d_max=...))"
+                )
+            bare, env = env, DummyVecEnv([lambda inner=inner: self.wrap_env(inner) for inner in env.envs])  # type: ignore[misc]
+            if bare._seeds[0] is not None:
+                env.seed(bare._seeds[0])
+        _warn_of_outer_monitors(env)
+        self._check_settings(env)
         return env
 
     def _check_env(self, env: VecEnv) -> OptionSettings:
@@ -209,6 +232,14 @@ class OptionOffPolicyAlgorithm(OffPolicyAlgorithm):
                         "runs on in AsyncOptionVecEnv: use SubprocVecEnv, or a Gymnasium wrapper inside"
                     )
                 wrapper = wrapper.venv
+        settings = self._check_settings(env)
+        self.primitive_action_space = env.get_attr("primitive_action_space")[0]
+        # No setting that both must share, but what one wants of the other.
+        env.env_method("set_n_sub_options", self.n_sub_options)
+        return settings
+
+    def _check_settings(self, env: VecEnv) -> OptionSettings:
+        """The options' settings of an environment, once options mean the same in it as to the algorithm."""
         settings: list[OptionSettings] = env.get_attr("option_settings")
         expected = {
             "n_rbf": self.n_rbf,
@@ -231,9 +262,6 @@ class OptionOffPolicyAlgorithm(OffPolicyAlgorithm):
                     f"the environment's actions are in {space}, {type(self).__name__} learned actions in "
                     f"{self.primitive_action_space or action_spaces[0]}: options mean the same in both only if these agree"
                 )
-        self.primitive_action_space = action_spaces[0]
-        # No setting that both must share, but what one wants of the other.
-        env.env_method("set_n_sub_options", self.n_sub_options)
         return settings[0]
 
     def set_env(self, env: GymEnv, force_reset: bool = True) -> None:
@@ -294,6 +322,8 @@ class OptionOffPolicyAlgorithm(OffPolicyAlgorithm):
             callback = CallbackList(callback)
         elif callback is not None and not isinstance(callback, BaseCallback):
             callback = ConvertCallback(callback)
+        for evaluating in eval_callbacks(callback):
+            evaluating.eval_env = self._as_eval_env(evaluating.eval_env)
         callbacks: list[BaseCallback] = [PrimitiveStepCallback(callback)]
         if progress_bar:
             callbacks.append(OptionProgressBarCallback())
@@ -389,9 +419,34 @@ class OptionOffPolicyAlgorithm(OffPolicyAlgorithm):
     ) -> tuple[np.ndarray, tuple[np.ndarray, ...] | None]:
         """The policy's *option* for an observation, not an action of the bare environment.
 
-        Step the wrapped environment (``model.get_env()``, or :meth:`wrap_env` around your own) with it.
+        Step the wrapped environment (``model.get_env()``, or :meth:`wrap_env` around your own) with it. A bare environment
+        that takes it for an action gets an error that says so, see :class:`~sb3_ctco.option_array.OptionArray`.
 
         :return: the option ``[ω, d]``, shape ``[action_dim · n_rbf + 1]`` in [−1, 1] (with a leading axis for several
             observations), and None
         """
-        return super().predict(observation, state, episode_start, deterministic)
+        options, state = super().predict(observation, state, episode_start, deterministic)
+        return options.view(OptionArray), state
+
+
+def _warn_of_outer_monitors(env: GymEnv) -> None:
+    """Warn of a Monitor that sees options, where a step of it is a decision."""
+    outside: gym.Env | VecEnv | None = unwrap_vec_wrapper(env, VecMonitor) if isinstance(env, VecEnv) else env
+    if isinstance(env, VecEnv) and outside is None and isinstance(env.unwrapped, DummyVecEnv):
+        outside = env.unwrapped.envs[0]
+    while isinstance(outside, gym.Wrapper) and not isinstance(outside, OptionExecutionWrapper | Monitor):
+        outside = outside.env
+    if isinstance(outside, Monitor | VecMonitor) and _plays_options(env):
+        name = type(outside).__name__
+        warnings.warn(
+            f"{name} is outside OptionExecutionWrapper, so the episode lengths that it reports count decisions, not "
+            "environment steps: use OptionExecutionWrapper(Monitor(env)), as model.wrap_env(env) and make_vec_env(..., "
+            "wrapper_class=OptionExecutionWrapper) do",
+            stacklevel=3,
+        )
+
+
+def _plays_options(env: GymEnv) -> bool:
+    if isinstance(env, VecEnv):
+        return all(env.env_is_wrapped(OptionExecutionWrapper))
+    return unwrap_wrapper(env, OptionExecutionWrapper) is not None
