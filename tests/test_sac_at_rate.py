@@ -24,7 +24,7 @@ SMALL = {"policy_kwargs": {"net_arch": [8]}, "batch_size": 8, "device": "cpu", "
 
 
 def test_the_agents_reward_is_in_the_unit_of_gamma_dt(scripted_env):
-    """At ``gamma_dt`` the rewards are as they are, as for stock SAC; a step of half that time is worth a little more than half."""
+    """At ``gamma_dt`` rewards are as they are, as for stock SAC; half that time is worth a little more than half."""
     for dt, expected in ((0.1, 3.0), (0.05, 3.0 / (1.0 + math.sqrt(0.9)))):
         model = sac_at_rate(scripted_env(rewards=lambda step, action: 3.0, dt=dt), dt=dt, gamma=0.9, gamma_dt=0.1)
         env = model.get_env()
