@@ -20,7 +20,6 @@ import time
 from pathlib import Path
 from typing import Any
 
-import gymnasium as gym
 import numpy as np
 import torch as th
 from torch import nn
@@ -31,8 +30,9 @@ from sb3_ctco.common.policies import EnsembleLinear
 from sb3_ctco.ctco.policies import CTCOPolicy, OptionCritic
 from sb3_ctco.envs import STUDY_RATES
 from sb3_ctco.options import discount
+from sb3_ctco.registry import TASKS, find_task
 from sb3_ctco.study import agents
-from sb3_ctco.study.grid import TASKS, Run, load_preset
+from sb3_ctco.study.grid import Run, load_preset
 from sb3_ctco.study.runs import git_commit
 
 RESULTS = Path(__file__).parents[1] / "results" / "extras.csv"
@@ -100,14 +100,14 @@ def make_model(run: Run, variant: str) -> CTCO:
         arguments["updates_per_second"] = 40
     if variant == "anneal_2":
         last = arguments["target_entropy_anneal"]  # by which they fall by one nat, and these functions by another
-        dim = arguments["n_rbf"] * gym.make(run.env_id).action_space.shape[0]
+        dim = arguments["n_rbf"] * find_task(run.task).make_env(run.rate).action_space.shape[0]
         arguments["target_entropy"] = lambda left: -dim - dim * max(0.0, 1.0 - left / last)
         arguments["duration_target_entropy"] = lambda left: -1.0 - max(0.0, 1.0 - left / last)
     if variant == "two_step":
         arguments["replay_buffer_class"] = TwoStepBuffer
         arguments["replay_buffer_kwargs"] = {"high_freq_penalty": arguments["high_freq_penalty"]}
     policy = LayerNormPolicy if variant == "layer_norm" else "MlpPolicy"
-    return CTCO(policy, run.env_id, seed=run.seed, device="cpu", **arguments)
+    return CTCO(policy, find_task(run.task).make_env(run.rate), seed=run.seed, device="cpu", **arguments)
 
 
 def perform(run: Run, variant: str) -> dict[str, Any]:

@@ -12,13 +12,14 @@ import sys
 import time
 from pathlib import Path
 
-import gymnasium as gym
 import matplotlib as mpl
 import numpy as np
 import pytest
 import yaml
 from rliable.metrics import aggregate_iqm
 
+from sb3_ctco.registry import ALGORITHMS as ALGORITHM_ROWS
+from sb3_ctco.registry import TASKS, Task, find_task
 from sb3_ctco.study import agents, plots, runs, status
 from sb3_ctco.study.cli import main
 from sb3_ctco.study.grid import Run, load_preset, preset_names
@@ -73,7 +74,7 @@ def wait_for(condition, seconds: float = 60.0) -> None:
 
 
 def test_the_presets_are_the_grids_that_they_should_be():
-    assert preset_names() == ["learning", "paper", "quick", "smoke"]
+    assert preset_names() == ["learning", "native", "paper", "quick", "smoke"]
     paper, quick = load_preset("paper"), load_preset("quick")
     assert len(paper.select(settings=["paper"])) == 30 * 4 * 3 * 4
     assert {run.task_seconds for run in paper.runs} == {400 * 60}
@@ -111,8 +112,9 @@ def test_seeds_may_be_others_than_the_presets() -> None:
 def test_every_setting_fits_its_constructor_and_environment(name):
     for run in load_preset(name).runs:
         agents.constructor_arguments(run)
-        assert gym.spec(run.env_id).kwargs["dt"] == pytest.approx(run.dt)
-        assert gym.spec(run.env_id).kwargs["time_limit"] == 10.0
+    for task, rate in {(run.task, run.rate) for run in load_preset(name).runs}:
+        spec = find_task(task).make_env(rate).spec
+        assert (spec.kwargs["dt"], spec.kwargs["time_limit"]) == (1 / rate, 10.0)
 
 
 @pytest.mark.parametrize("rate", [50, 500])
@@ -140,8 +142,11 @@ def test_seconds_become_steps(algorithm, rate):
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
-        ({"tasks": ["walker"]}, r"tasks must be a list of some of .*'ball_in_cup'.* not \['walker'\]"),
-        ({"rates": [60]}, r"rates must be a list of some of \(50, 100, 250, 500\), each once, not \[60\]"),
+        ({"tasks": ["walker"]}, r"no task 'walker': name one of .*'ball_in_cup'\], or an id of Gymnasium's registry"),
+        ({"tasks": ["cheetah", "cheetah"]}, "tasks must be a list of tasks, each once, or a mapping"),
+        ({"tasks": {"cheetah": {"rate": 50}}}, r"task cheetah: \[\] missing, \['rate'\] unknown"),
+        ({"tasks": {"cheetah": {"evaluations": 0}}}, "task cheetah: evaluations must be a whole number from 1, not 0"),
+        ({"rates": [50.5]}, r"rates must be a list of whole numbers of Hz, each once, not \[50.5\]"),
         ({"seeds": 0}, "seeds must be a whole number from 1, not 0"),
         ({"task_seconds": 50}, "task_seconds must be at least 100, so that an episode of 10 s ends in the last tenth"),
         ({"step": 1}, r"\[\] missing, \['step'\] unknown"),
@@ -156,7 +161,10 @@ def test_mistakes_in_a_preset(tmp_path, changes, message):
 def test_mistakes_on_the_command_line(tmp_path, capsys):
     preset = tiny(tmp_path, algorithms={"ctco": {"setting": "a", "arguments": {"gama": 0.9}}})
     for arguments, message in [
-        (["run", "--preset", "none"], "no preset 'none': name one of ['learning', 'paper', 'quick', 'smoke'], or a YAML file"),
+        (
+            ["run", "--preset", "none"],
+            "no preset 'none': name one of ['learning', 'native', 'paper', 'quick', 'smoke'], or a YAML file",
+        ),
         (["run", "--preset", "quick", "--rates", "60"], "preset quick has no rate [60]; it has [50, 100, 250, 500]"),
         (["run", "--preset", preset], "ctco (a) has no arguments ['gama']"),
         (["run", "--preset", preset, "--workers", "0"], "--workers must be at least 1, not 0"),
@@ -343,6 +351,40 @@ def open_files(pid: int) -> set[str]:
 # --- records and figures
 
 
+def test_a_native_task_runs_at_its_own_rate(tmp_path):
+    """Any Gymnasium id, and its plain sum of rewards beside the discounted return."""
+    arguments = {"gamma": 0.99, "gamma_dt": 0.05, "updates_per_second": 0.1, "learning_starts_seconds": 20, "batch_size": 8}
+    preset = tiny(
+        tmp_path,
+        tasks={"Pendulum-v1": {"rates": [20], "evaluations": 2, "arguments": arguments}},
+        algorithms={name: {"setting": "small", "arguments": {}} for name in ("ctco", "sac")},
+        seeds=1,
+    )
+    assert main(["run", "--preset", preset, "--folder", str(tmp_path / "study"), "--workers", "1"]) == 0
+    records = read_records(tmp_path / "study")
+    assert [record["algorithm"] for record in records] == ["ctco", "sac"]
+    for record in records:
+        assert record["dt"] == 0.05
+        assert -2000 < record["greedy_episode_return"] < -500
+        # A reward of r all the time is worth 200·r in sum, and (1 − e^(−10τ))/τ·r = 4.3·r discounted.
+        assert 4.3 / 200 * 0.3 < record["greedy_return"] / record["greedy_episode_return"] < 4.3 / 200 * 3
+    rows = list(csv.DictReader((tmp_path / "study" / "Pendulum-v1-sac_small-20hz-seed0" / "evaluation.csv").open()))
+    assert [float(row["task_seconds"]) for row in rows] == pytest.approx([95, 100])
+    with pytest.raises(ValueError, match="task Pendulum-v1 runs at 20 Hz, not at 50 Hz"):
+        find_task("Pendulum-v1").make_env(50)
+
+
+def test_a_row_makes_an_algorithm_and_a_task_part_of_a_study(tmp_path, monkeypatch):
+    row = dataclasses.replace(ALGORITHM_ROWS["ctco"], name="dummy", label="a dummy", colour="C7")
+    monkeypatch.setitem(ALGORITHM_ROWS, "dummy", row)
+    monkeypatch.setitem(TASKS, "swing", Task("swing", "a swing", "sb3_ctco/pendulum-swingup-v0"))
+    arguments = yaml.safe_load(Path(tiny(tmp_path)).read_text())["algorithms"]["ctco"]
+    preset = tiny(tmp_path, tasks=["swing"], rates=[25], algorithms={"dummy": arguments}, seeds=1)
+    assert main(["run", "--preset", preset, "--folder", str(tmp_path / "study"), "--workers", "1"]) == 0
+    assert main(["plot", str(tmp_path / "study")]) == 0
+    assert "| a swing | a dummy | small |" in (tmp_path / "study" / "figures" / "table.md").read_text()
+
+
 def synthetic(n_seeds: int = 2) -> list[dict]:
     """Records whose returns are the paper's, ±0.1 with the seeds 0 and 1; CTCO with two settings."""
     records = []
@@ -352,6 +394,8 @@ def synthetic(n_seeds: int = 2) -> list[dict]:
         rate = 3.0 if run.algorithm == "ctco" else float(run.rate)
         made = {"discounted_return": value, "greedy_return": value + 0.2, "decision_rate_hz": rate}
         made |= {
+            "episode_return": 50 * value,
+            "greedy_episode_return": 50 * value,
             "greedy_decision_rate_hz": rate,
             "updates": 48000,
             "wall_seconds": 100.0,
@@ -421,7 +465,8 @@ def test_the_figure_shows_the_records_and_the_paper():
     for ax, task in zip(figure.axes, ("point_mass", "cheetah", "ball_in_cup"), strict=True):
         lines = {line.get_label(): line for line in ax.get_lines()}
         assert ax.get_xscale() == "log"
-        for algorithm, name in plots.ALGORITHM_NAMES.items():
+        for algorithm, row in ALGORITHM_ROWS.items():
+            name = row.label
             numbers = paper_returns()[task, algorithm]
             setting = "tuned" if algorithm == "ctco" else "large"
             for label in (f"{name} ({setting})", f"{name}, the paper's figure"):

@@ -30,11 +30,18 @@ class RewardRateWrapper(gym.Wrapper, RecordConstructorArgs):
     :param env: the environment to wrap
     :param dt: the interaction period, in s; by default what :func:`~sb3_ctco.wrappers.find_dt` finds
     :param discount_rate: τ, in 1/s; by default the paper's 0.404 (a factor of 0.98 over 0.05 s)
+    :param reward_scale: what rewards are multiplied by, too, for the agent alone: ``info["option"]`` tells the integral
     :raises ValueError: if a setting is out of range, or dt is not given and not found
     """
 
-    def __init__(self, env: gym.Env, dt: float | None = None, discount_rate: float = DEFAULT_DISCOUNT_RATE):
-        RecordConstructorArgs.__init__(self, dt=dt, discount_rate=discount_rate)
+    def __init__(
+        self,
+        env: gym.Env,
+        dt: float | None = None,
+        discount_rate: float = DEFAULT_DISCOUNT_RATE,
+        reward_scale: float = 1.0,
+    ):
+        RecordConstructorArgs.__init__(self, dt=dt, discount_rate=discount_rate, reward_scale=reward_scale)
         gym.Wrapper.__init__(self, env)
         if dt is None:
             dt = find_dt(env)
@@ -45,6 +52,7 @@ class RewardRateWrapper(gym.Wrapper, RecordConstructorArgs):
             )
         #: The clock: a step as an option of one step
         self.option_settings = OptionSettings(n_rbf=1, d_max=dt, d_min=dt, dt=dt, discount_rate=discount_rate)
+        self.reward_scale = reward_scale
         self._weight = step_weight(dt, discount_rate)
         self._discount = float(discount(dt, discount_rate))
 
@@ -63,4 +71,4 @@ class RewardRateWrapper(gym.Wrapper, RecordConstructorArgs):
             "integrated_reward": integral,
             "discount": self._discount,
         }
-        return obs, integral, terminated, truncated, info
+        return obs, integral * self.reward_scale, terminated, truncated, info

@@ -60,7 +60,7 @@ class EpisodeStatistics:
     :param discounted_return: ∫ e^(−τt) r dt, equation (2) of Karimi et al. 2023, in reward rate × s
     :param seconds: task time of the episode, in s
     :param decisions: how often the policy was asked
-    :param episode_return: sum of the rewards that ``step`` returned
+    :param episode_return: sum of the primitive rewards, from ``Monitor``; without one, of what ``step`` returned
     :param mean_absolute_jerk: of the primitive actions, see :func:`mean_absolute_jerk`; nan if not measured
     :param spectral_smoothness: likewise, see :func:`spectral_smoothness`
     """
@@ -109,6 +109,8 @@ class _EpisodeTracker:
             episode.decisions += 1
             episode.episode_return += float(reward)
             if done:
+                if "episode" in info:
+                    episode.episode_return = info["episode"]["r"]
                 ended.append(episode)
                 self.running[i] = EpisodeStatistics()
         return ended

@@ -1,6 +1,8 @@
 """Soft actor-critic on options: what CTCO and FiGAR-SAC share, their losses and the loop of updates."""
 
+import contextlib
 import math
+from collections.abc import Callable, Iterator
 from typing import Any
 
 import torch as th
@@ -171,9 +173,9 @@ class SoftOptionActorCritic(OptionOffPolicyAlgorithm):
 
         self._target_entropies.copy_(th.tensor(self._current_target_entropies()))
         losses = []
-        for _ in range(gradient_steps):
-            data = self.replay_buffer.sample(batch_size, env=self._vec_normalize_env)
-            losses.append(self._update(data))
+        with self._begin_updates() as update:
+            for _ in range(gradient_steps):
+                losses.append(update(self.replay_buffer.sample(batch_size, env=self._vec_normalize_env)))
 
         self._n_updates += gradient_steps
         # Read once, because each reading waits for the device.
@@ -191,6 +193,11 @@ class SoftOptionActorCritic(OptionOffPolicyAlgorithm):
     def ent_coefs(self) -> th.Tensor:
         """Both temperatures, of what to do and of the duration, ``[2]``, without gradients."""
         return self.log_ent_coefs.detach().exp()
+
+    @contextlib.contextmanager
+    def _begin_updates(self) -> Iterator[Callable[[ReplayBufferSamples], th.Tensor]]:
+        """What makes the updates of a training: :meth:`_update`, or something faster that computes the same."""
+        yield self._update
 
     def _update(self, data: ReplayBufferSamples) -> th.Tensor:
         """One update of temperatures, critics, actor and targets.

@@ -1,6 +1,8 @@
 """Continuous-Time Continuous-Options (Karimi et al. 2023, https://arxiv.org/abs/2212.04407) on Stable-Baselines3."""
 
+import contextlib
 import math
+from collections.abc import Callable, Iterator
 from typing import Any, ClassVar, Literal, TypeVar
 
 import torch as th
@@ -13,7 +15,7 @@ from torch import nn
 
 from sb3_ctco.common.buffers import DictOptionReplayBuffer, OptionReplayBuffer
 from sb3_ctco.common.soft_actor_critic import SoftOptionActorCritic, critic_loss, critic_target
-from sb3_ctco.ctco.gradients import HandGradients
+from sb3_ctco.ctco.fast_update import FastUpdate
 from sb3_ctco.ctco.policies import CnnPolicy, CTCOPolicy, MlpPolicy, MultiInputPolicy, OptionActor, OptionCritic
 
 __all__ = ["CTCO", "actor_loss", "critic_loss", "critic_target", "log_reference_density"]
@@ -113,6 +115,8 @@ class CTCO(SoftOptionActorCritic):
         one nat a dimension in all: explore first, then get precise; 0 keeps them
     :param duration_learning_rate: step size of d's head; ``learning_rate`` by default
     :param entropy_reference: ``"uniform"``, ``"paper"`` or ``"duration"``, see :func:`log_reference_density`
+    :param fast_updates: whether to compute gradients without autograd where that is known to give the same, see
+        :mod:`sb3_ctco.ctco.fast_update`; ``fast_updates_refusal`` says why not where it is not
     :param action_noise: noise added to normalised options while exploring
     :param replay_buffer_class: ``OptionReplayBuffer`` or ``DictOptionReplayBuffer``, or a subclass
     :param replay_buffer_kwargs: keyword arguments for the replay buffer
@@ -165,6 +169,7 @@ class CTCO(SoftOptionActorCritic):
         target_entropy_anneal: float = 0.0,
         duration_learning_rate: float | Schedule | None = None,
         entropy_reference: EntropyReference = "uniform",
+        fast_updates: bool = True,
         action_noise: ActionNoise | None = None,
         replay_buffer_class: type[ReplayBuffer] | None = None,
         replay_buffer_kwargs: dict[str, Any] | None = None,
@@ -222,6 +227,7 @@ class CTCO(SoftOptionActorCritic):
         self.high_freq_penalty = high_freq_penalty
         self.target_decision_rate = target_decision_rate
         self.target_entropy_anneal = target_entropy_anneal
+        self.fast_updates = fast_updates
         self.duration_learning_rate = duration_learning_rate
         self.entropy_reference: EntropyReference = entropy_reference
 
@@ -252,10 +258,9 @@ class CTCO(SoftOptionActorCritic):
 
     def _setup_model(self) -> None:
         super()._setup_model()
-        self._duration_lr_schedule = (
-            self.lr_schedule if self.duration_learning_rate is None else FloatSchedule(self.duration_learning_rate)
-        )
-        self._hand_gradients: HandGradients | None = None
+        self._fast_update: FastUpdate | None = None
+        #: Why updates were made with autograd in the last training; None if they were not
+        self.fast_updates_refusal: str | None = None
         if self.target_decision_rate is not None:
             assert isinstance(self.high_freq_penalty, int | float)
             self.log_high_freq_penalty = th.tensor(math.log(self.high_freq_penalty), requires_grad=True)
@@ -286,7 +291,9 @@ class CTCO(SoftOptionActorCritic):
 
     def _update_learning_rate(self, optimizers: list[th.optim.Optimizer] | th.optim.Optimizer) -> None:
         super()._update_learning_rate(optimizers)
-        self.actor.optimizer.param_groups[1]["lr"] = self._duration_lr_schedule(self._current_progress_remaining)
+        if self.duration_learning_rate is not None:
+            step_size = FloatSchedule(self.duration_learning_rate)(self._current_progress_remaining)
+            self.actor.optimizer.param_groups[1]["lr"] = step_size
 
     def entropy_costs(self, options: th.Tensor, log_prob: th.Tensor) -> th.Tensor:
         """β_E log π relative to the reference, ω's and d's with their own temperature.
@@ -337,38 +344,29 @@ class CTCO(SoftOptionActorCritic):
         """
         if self.target_decision_rate is not None:
             self._update_high_freq_penalty()
-        self._prepare_hand_gradients()
-        try:
-            super().train(gradient_steps, batch_size)
-        finally:  # also what was learned until somebody pressed Ctrl-C
-            if self._hand_gradients is not None:
-                self._hand_gradients.store()
+        super().train(gradient_steps, batch_size)
         self.logger.record("option/high_freq_penalty", self._current_high_freq_penalty())
 
-    def _prepare_hand_gradients(self) -> None:
-        # Not possible before the first update, with which optimizers get their state.
-        if not (self._has_own_losses() and HandGradients.possible_for(self)):
-            self._hand_gradients = None
+    @contextlib.contextmanager
+    def _begin_updates(self) -> Iterator[Callable[[ReplayBufferSamples], th.Tensor]]:
+        refusal = FastUpdate.refusal(self) if self.fast_updates else "fast_updates=False"
+        self.logger.record("train/fast_updates", float(refusal is None))
+        if refusal is not None:
+            self._fast_update = None
+            # Before the first update, with which optimizers get their state, there is always a reason.
+            if refusal != self.fast_updates_refusal and self._n_updates > 0 and self.verbose > 0:
+                print(f"Updates are made with autograd: {refusal}")
+            self.fast_updates_refusal = refusal
+            yield self._update
             return
-        if self._hand_gradients is None or not self._hand_gradients.is_valid():
-            self._hand_gradients = HandGradients(self)
-        self._hand_gradients.load()
-
-    def _has_own_losses(self) -> bool:
-        """Whether no subclass changed what the gradients were worked out for."""
-        names = (
-            "_sample_policy",
-            "_critic_targets",
-            "_q_values",
-            "_actor_loss",
-            "_update_temperatures",
-            "_update_targets",
-            "entropy_costs",
-        )
-        return all(getattr(type(self), name) is getattr(CTCO, name) for name in names)
-
-    def _update(self, data: ReplayBufferSamples) -> th.Tensor:
-        return super()._update(data) if self._hand_gradients is None else self._hand_gradients.update(data)
+        self.fast_updates_refusal = None
+        if self._fast_update is None or not self._fast_update.is_valid():
+            self._fast_update = FastUpdate(self)
+        self._fast_update.load()
+        try:
+            yield self._fast_update.update
+        finally:  # also what was learned until somebody pressed Ctrl-C
+            self._fast_update.store()
 
     def _current_high_freq_penalty(self) -> float:
         if self.target_decision_rate is not None:
@@ -417,7 +415,7 @@ class CTCO(SoftOptionActorCritic):
         )
 
     def _excluded_save_params(self) -> list[str]:
-        return [*super()._excluded_save_params(), "actor_target", "_log_reference", "_hand_gradients"]
+        return [*super()._excluded_save_params(), "actor_target", "_log_reference", "_fast_update", "fast_updates_refusal"]
 
     def _get_torch_save_params(self) -> tuple[list[str], list[str]]:
         state_dicts, tensors = super()._get_torch_save_params()

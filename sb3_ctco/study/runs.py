@@ -17,6 +17,7 @@ from typing import Any, Literal
 
 import numpy as np
 import torch as th
+from stable_baselines3.common.base_class import BaseAlgorithm
 
 import sb3_ctco
 from sb3_ctco.common.evaluation import DiscountedReturnCallback, EpisodeStatistics, evaluate_discounted_return
@@ -26,7 +27,7 @@ from sb3_ctco.study.grid import Run
 SETTINGS, VERSIONS, RECORD, ERROR, LOCK = "settings.json", "versions.json", "record.json", "error.txt", "lock"
 MONITOR, EVALUATION = "monitor.csv", "evaluation.csv"
 MONITOR_COLUMNS = ("task_seconds", "discounted_return", "decision_rate_hz", "wall_seconds")
-EVALUATION_COLUMNS = ("discounted_return", "decision_rate_hz")
+EVALUATION_COLUMNS = ("task_seconds", "discounted_return", "decision_rate_hz", "episode_return")
 _PACKAGES = ("sb3-ctco", "stable-baselines3", "torch", "numpy", "gymnasium", "mujoco", "dm-control")
 
 
@@ -133,11 +134,14 @@ def is_running(path: Path) -> bool:
 
 
 class _Monitor(DiscountedReturnCallback):
-    """Writes each training episode to a CSV file as it ends."""
+    """Writes each training episode to a CSV file as it ends, and evaluates in the last tenth of task time."""
 
     def __init__(self, run: Run, file: Path, study_pid: int | None):
         super().__init__(discount_rate(run))
         self.run, self.file, self.study_pid = run, file, study_pid
+        #: Greedy episodes, and the task time in s at which they were played
+        self.greedy: list[tuple[float, EpisodeStatistics]] = []
+        self._evaluations_left = run.evaluations
 
     def _on_training_start(self) -> None:
         super()._on_training_start()
@@ -154,7 +158,21 @@ class _Monitor(DiscountedReturnCallback):
                 csv.writer(file).writerow([_short(value) for value in row])
             if self.study_pid is not None and self.study_pid not in (os.getpid(), os.getppid()):
                 os._exit(1)  # Nobody waits for this run any more. The next study begins it again.
+        seconds = self.num_timesteps * self.run.dt
+        # The last evaluation is that of the model which is saved.
+        if self._evaluations_left > 1 and seconds >= self.run.task_seconds * (
+            1.0 - 0.1 * (self._evaluations_left - 1) / self.run.evaluations
+        ):
+            self.evaluate(self.model)
         return proceed
+
+    def evaluate(self, model: BaseAlgorithm) -> None:
+        """Play greedy episodes."""
+        self._evaluations_left -= 1
+        env = make_eval_env(self.run, model)
+        episodes = evaluate_discounted_return(model, env, self.run.eval_episodes, discount_rate=discount_rate(self.run))
+        env.close()
+        self.greedy += [(self.num_timesteps * self.run.dt, episode) for episode in episodes]
 
     def last_tenth(self) -> list[EpisodeStatistics]:
         """The episodes that ended in the last tenth of task time."""
@@ -173,12 +191,16 @@ def _train(run: Run, path: Path, study_pid: int | None) -> None:
     wall_seconds = time.monotonic() - start
     model.save(path / "model.zip")
 
-    eval_env = make_eval_env(run, model)
-    greedy = evaluate_discounted_return(model, eval_env, run.eval_episodes, discount_rate=discount_rate(run))
-    _write_csv(path / EVALUATION, EVALUATION_COLUMNS, [(e.discounted_return, e.decision_rate_hz) for e in greedy])
-    for env in (model.get_env(), eval_env):
-        assert env is not None
-        env.close()
+    monitor.evaluate(model)
+    greedy = [episode for _, episode in monitor.greedy]
+    _write_csv(
+        path / EVALUATION,
+        EVALUATION_COLUMNS,
+        [(seconds, e.discounted_return, e.decision_rate_hz, e.episode_return) for seconds, e in monitor.greedy],
+    )
+    env = model.get_env()
+    assert env is not None
+    env.close()
     training = monitor.last_tenth()
     record = {
         "task": run.task,
@@ -194,6 +216,8 @@ def _train(run: Run, path: Path, study_pid: int | None) -> None:
         "preset": run.preset,
         "setting": run.setting,
         "greedy_decision_rate_hz": _short(np.mean([e.decision_rate_hz for e in greedy])),
+        "episode_return": _short(np.mean([e.episode_return for e in training])),
+        "greedy_episode_return": _short(np.mean([e.episode_return for e in greedy])),
         "commit": commit,
         "fingerprint": run.fingerprint,
         "versions": " ".join(f"{name}={version}" for name, version in versions.items()),
