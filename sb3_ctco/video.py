@@ -91,6 +91,7 @@ class RecordEpisodes(gym.Wrapper, RecordConstructorArgs):
         try:
             frame = self.env.render()
         except Exception as error:
+            self._close_bar()
             raise RuntimeError(
                 f"{self.env} could not render: {error}. Without a display, MuJoCo draws with MUJOCO_GL=egl (or osmesa), set "
                 "before Python starts; on Debian, apt install libegl1 libgl1-mesa-dri"
@@ -99,10 +100,13 @@ class RecordEpisodes(gym.Wrapper, RecordConstructorArgs):
         if self._bar is not None:
             self._bar.update()
 
-    def _write(self) -> None:
+    def _close_bar(self) -> None:
         if self._bar is not None:
             self._bar.close()
             self._bar = None
+
+    def _write(self) -> None:
+        self._close_bar()
         if not self._frames:
             return
         from moviepy.video.io.ImageSequenceClip import ImageSequenceClip  # noqa: PLC0415

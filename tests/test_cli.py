@@ -1,12 +1,16 @@
 """The command ``sb3-ctco`` where something is missing."""
 
+import re
 import subprocess
 import sys
+from pathlib import Path
 
 import pytest
 
 import sb3_ctco
 from sb3_ctco.cli import main
+
+ROOT = Path(__file__).parents[1]
 
 
 def run_without(modules, *arguments):
@@ -36,7 +40,11 @@ def test_help_needs_no_extra():
         ("rl_zoo3", ["train", "--env", "Pendulum-v1"], "sb3-ctco train: .*rl_zoo3 is missing.*pip install '.[zoo]'"),
         ("optuna", ["enjoy", "--env", "Pendulum-v1"], "sb3-ctco enjoy: .*optuna is missing.*pip install '.[zoo]'"),
         ("yaml", ["study", "run", "--preset", "smoke"], "sb3-ctco study run: yaml is missing.*pip install '.[study]'"),
-        ("rliable", ["study", "plot", "results"], "sb3-ctco study plot: rliable.* is missing.*pip install '.[study]'"),
+        (
+            "rliable",
+            ["study", "plot", f"{ROOT}/results/quick.csv"],
+            "sb3-ctco study plot: rliable is missing.*pip install '.[study]'",
+        ),
     ],
 )
 def test_a_missing_extra_is_named(missing, arguments, said):
@@ -48,10 +56,6 @@ def test_a_missing_extra_is_named(missing, arguments, said):
 
 
 def test_no_error_names_an_index_where_the_package_is_not():
-    import re
-    from pathlib import Path
-
-    root = Path(sb3_ctco.__file__).parents[1]
-    files = [*root.glob("sb3_ctco/**/*.py"), *root.glob("wrappers/*.py"), *root.glob("examples/*.py")]
+    files = [*ROOT.glob("sb3_ctco/**/*.py"), *ROOT.glob("wrappers/*.py"), *ROOT.glob("examples/*.py")]
     assert len(files) > 40
     assert [file for file in files if re.search(r"pip install .?sb3-ctco", file.read_text())] == []

@@ -14,13 +14,16 @@ from sb3_ctco.ctco import CTCOPolicy
 from sb3_ctco.dac_ppo import DACPolicy
 from sb3_ctco.figar_sac import FiGARSACPolicy
 
-SMALL = {"policy_kwargs": {"net_arch": [8]}, "seed": 0}
+
+def small():
+    """A dictionary of its own each time, because Stable-Baselines3 writes into policy_kwargs."""
+    return {"policy_kwargs": {"net_arch": [8]}, "seed": 0}
 
 
 @pytest.mark.parametrize("reader", [CTCO, FiGARSAC])
 @pytest.mark.parametrize("writer", [SAC, TD3, PPO, DACPPO, CTCO, FiGARSAC])
 def test_files_of_other_algorithms_are_refused_with_their_name(tmp_path, reader, writer):
-    writer("MlpPolicy", "Pendulum-v1", **SMALL).save(tmp_path / "model")
+    writer("MlpPolicy", "Pendulum-v1", **small()).save(tmp_path / "model")
     if reader is writer:
         assert type(reader.load(tmp_path / "model", env=gym.make("Pendulum-v1"))) is reader
         with (tmp_path / "model.zip").open("rb") as file:
@@ -34,12 +37,12 @@ def test_files_of_other_algorithms_are_refused_with_their_name(tmp_path, reader,
     ("algorithm", "policy"), [(CTCO, CTCOPolicy), (FiGARSAC, FiGARSACPolicy), (DACPPO, DACPolicy)], ids=lambda x: x.__name__
 )
 def test_policies_are_where_the_algorithms_are(algorithm, policy):
-    assert type(algorithm(policy, "Pendulum-v1", **SMALL).policy) is policy
+    assert type(algorithm(policy, "Pendulum-v1", **small()).policy) is policy
 
 
 def test_a_buffer_that_does_not_fit_is_named(random_walk_env, monkeypatch):
     monkeypatch.setattr(option_algorithm, "_available_memory", lambda: 10_000)
-    kwargs = {"n_sub_options": 4, "d_max": 0.5, **SMALL}
+    kwargs = {"n_sub_options": 4, "d_max": 0.5, **small()}
     with pytest.warns(UserWarning, match=r"buffer_size=1,000 plans 0\.0 GB.*pass a smaller one, [0-9]+ for half") as caught:
         CTCO("MlpPolicy", random_walk_env(), buffer_size=1_000, **kwargs)
     # A fifth of the rows may be decisions, of 0.1 to 0.5 s.
@@ -48,7 +51,7 @@ def test_a_buffer_that_does_not_fit_is_named(random_walk_env, monkeypatch):
 
 @pytest.mark.filterwarnings("error:.*buffer_size.*")
 def test_a_buffer_that_fits_is_not(random_walk_env):
-    CTCO("MlpPolicy", random_walk_env(), buffer_size=1_000, **SMALL)
+    CTCO("MlpPolicy", random_walk_env(), buffer_size=1_000, **small())
 
 
 def test_the_default_for_images_says_how_much_it_plans(monkeypatch):
@@ -71,8 +74,8 @@ def test_memory_of_this_machine():
 @pytest.mark.parametrize("algorithm", [CTCO, FiGARSAC])
 def test_a_missing_dt_names_the_algorithms_argument(scripted_env, algorithm):
     with pytest.raises(ValueError, match=r"CTCO\(\.\.\., dt=0\.02\).*OptionExecutionWrapper"):
-        algorithm("MlpPolicy", scripted_env(dt=None), **SMALL)
-    algorithm("MlpPolicy", scripted_env(dt=None), dt=0.02, **SMALL)
+        algorithm("MlpPolicy", scripted_env(dt=None), **small())
+    algorithm("MlpPolicy", scripted_env(dt=None), dt=0.02, **small())
 
 
 def test_dm_controls_deprecations_are_not_shown():

@@ -273,6 +273,7 @@ def test_two_studies_on_one_folder(finished, tmp_path, capsys):
     assert not runs.is_running(first)
 
 
+@pytest.mark.slow
 def test_two_studies_at_once_make_each_run_once(tmp_path):
     preset, folder = tiny(tmp_path, seeds=3), tmp_path / "study"
     arguments = [*COMMAND, "run", "--preset", preset, "--folder", str(folder), "--workers", "1"]
@@ -286,6 +287,7 @@ def test_two_studies_at_once_make_each_run_once(tmp_path):
         assert len(seconds) == 10
 
 
+@pytest.mark.slow
 def test_kill_9_loses_only_the_runs_in_flight(tmp_path):
     preset, folder = tiny(tmp_path, seeds=6), tmp_path / "study"
     arguments = ["run", "--preset", preset, "--folder", str(folder), "--workers", "2"]
@@ -302,6 +304,7 @@ def test_kill_9_loses_only_the_runs_in_flight(tmp_path):
     assert {file: file.stat().st_mtime_ns for file in done} == done
 
 
+@pytest.mark.slow
 def test_a_worker_that_dies_is_replaced(tmp_path):
     preset, folder = tiny(tmp_path, seeds=4), tmp_path / "study"
     arguments = ["run", "--preset", preset, "--folder", str(folder), "--workers", "2"]

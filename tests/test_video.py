@@ -97,6 +97,7 @@ def test_refusals(tmp_path):
         RecordEpisodes(Canvas(fail=True), tmp_path).reset()
 
 
+@pytest.mark.slow
 def test_without_a_display_watch_says_what_to_set(tmp_path):
     """With a backend that cannot be had here, whatever this machine has."""
     pytest.importorskip("dm_control")
@@ -117,6 +118,7 @@ def test_without_a_display_watch_says_what_to_set(tmp_path):
     assert "MUJOCO_GL=egl" in result.stderr.splitlines()[-1]
 
 
+@pytest.mark.slow
 def test_watch_films_the_task_that_its_arguments_name(tmp_path, opengl):
     pytest.importorskip("moviepy")
     from sb3_ctco import CTCO

@@ -62,7 +62,13 @@ def test_packaged_files_have_the_same_entries_default_first(algo):
 
 
 @pytest.mark.parametrize(
-    ("algo", "name"), [(algo, name) for algo in ("ctco", "sac") for name in entries(algo)], ids=lambda value: value
+    ("algo", "name"),
+    [
+        pytest.param(algo, name, marks=[] if name in ("default", "Pendulum-v1") else pytest.mark.slow)
+        for algo in ("ctco", "sac")
+        for name in entries(algo)
+    ],
+    ids=lambda value: value,
 )
 def test_each_entry_builds_and_takes_200_steps(request, tmp_path, models, algo, name):
     env_id = "sb3_ctco/cartpole-swingup-v0" if name == "default" else name
@@ -151,6 +157,7 @@ def test_environments_in_processes_of_their_own(tmp_path, models):
     assert models[0].num_timesteps >= 200
 
 
+@pytest.mark.slow
 def test_two_trials_of_tuning(tmp_path):
     flags = ["--env", "Pendulum-v1", "-f", str(tmp_path), "-n", "400", "--seed", "0", "--n-trials", "2"]
     flags += ["--n-evaluations", "2", "--eval-episodes", "1", "--pruner", "none", "--no-optim-plots"]

@@ -307,10 +307,13 @@ class OptionOffPolicyAlgorithm(OffPolicyAlgorithm):
 
     @classmethod
     def _refuse_files_of_others(cls, path: str | pathlib.Path | io.BufferedIOBase) -> None:
-        with open_path(path, "r", verbose=0, suffix="zip") as file:
-            attributes = json.loads(zipfile.ZipFile(file).read("data")) if zipfile.is_zipfile(file) else {}
-            writer = attributes.get("policy_class", {}).get("__module__", "an unknown module")
+        file = open_path(path, "r", verbose=0, suffix="zip")
+        attributes = json.loads(zipfile.ZipFile(file).read("data")) if zipfile.is_zipfile(file) else {}
+        if file is path:
             file.seek(0)
+        else:
+            file.close()
+        writer = attributes.get("policy_class", {}).get("__module__", "an unknown module")
         if attributes and cls._own_setting not in attributes:
             raise ValueError(
                 f"{path} was not saved by {cls.__name__}: its policy is from {writer}. Load it with the class that saved it"

@@ -25,7 +25,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         return args.call(args)
     except ModuleNotFoundError as error:
         print(
-            f"sb3-ctco study {args.command}: {error.name} is missing: in a clone of sb3-ctco, run pip install '.[study]'",
+            f"sb3-ctco study {args.command}: {(error.name or str(error)).partition('.')[0]} is missing: in a clone of sb3-ctco, run pip install '.[study]'",
             file=sys.stderr,
         )
         return FAILED
