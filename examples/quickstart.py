@@ -124,7 +124,7 @@ def draw_learning_curve(curve: DiscountedReturnCallback, dt: float, random: floa
 
 def draw_episode(model: CTCO, env: OptionExecutionWrapper, seed: int, path: Path) -> None:
     """Play one greedy episode primitive step by primitive step, and draw its actions, decisions and rewards."""
-    bare, dt = env.env, env.option_settings.dt
+    bare, dt = env.env, env.option_space.dt
     obs, _ = bare.reset(seed=seed)
     actions: list[np.ndarray] = []
     rewards: list[float] = []

@@ -443,8 +443,8 @@ def test_options_of_one_step_are_sac(scripted_env):
 
 def test_a_bare_environment_is_wrapped(random_walk_env):
     model = make(random_walk_env(), n_rbf=2, d_max=0.7, gamma=0.9, gamma_dt=0.1)
-    settings = model.get_env().get_attr("option_settings")[0]
-    assert (settings.n_rbf, settings.d_max, settings.d_min, settings.dt) == (2, 0.7, 0.1, 0.1)
+    settings = model.get_env().get_attr("option_space")[0]
+    assert (settings.trajectory.n_weights, settings.d_max, settings.d_min, settings.dt) == (2, 0.7, 0.1, 0.1)
     assert settings.discount_rate == pytest.approx(-math.log(0.9) / 0.1)
     assert (model.dt, model.d_min) == (0.1, 0.1)
     assert model.action_space.shape == (3,)
@@ -616,7 +616,7 @@ def test_save_and_load(tmp_path, random_walk_env):
 
     bare = CTCO.load(tmp_path / "model", env=random_walk_env())
     np.testing.assert_array_equal(bare.predict(obs, deterministic=True)[0], expected)
-    assert bare.get_env().get_attr("option_settings")[0].d_max == 0.7
+    assert bare.get_env().get_attr("option_space")[0].d_max == 0.7
 
     wrapped = OptionExecutionWrapper(random_walk_env(), n_rbf=2, d_max=0.7, d_min=0.2)
     CTCO.load(tmp_path / "model", env=wrapped).learn(30)

@@ -12,7 +12,7 @@ from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.evaluation import evaluate_policy
 from stable_baselines3.common.monitor import Monitor
 
-from sb3_ctco.options import action_plan
+from sb3_ctco.options import RadialBasis
 from sb3_ctco.wrappers import OptionExecutionWrapper, SupportsStepSequence, find_dt
 
 TAU = math.log(2.0)  # half in a second
@@ -73,7 +73,7 @@ def test_actions_are_mapped_to_the_bounds_of_any_shape(scripted_env):
     # ω is [action_dim, n_rbf] flattened: the first two weights drive the first action entry, halfway up its range.
     omega = np.array([[0.0, 0.0], [1.0, -1.0], [0.0, 0.0], [0.0, 0.0]])
     env.step(np.concatenate([omega.ravel(), [1.0]]))
-    plan = action_plan(omega, 3)
+    plan = RadialBasis(omega.shape[1]).plan(omega, 3)
     for action, expected in zip(env.unwrapped.actions[-3:], plan, strict=True):
         np.testing.assert_allclose(action, [[0.5, 3.0 * expected[1]], [5.5, -0.5]], rtol=1e-6)
 
@@ -200,7 +200,7 @@ def test_dt_is_found(scripted_env):
     assert find_dt(env) == pytest.approx(0.02)
     assert find_dt(gym.make("Pendulum-v1")) == pytest.approx(0.05)
     # An explicit dt goes before everything found.
-    assert wrap(env, dt=0.5).option_settings.dt == 0.5
+    assert wrap(env, dt=0.5).option_space.dt == 0.5
 
 
 def test_dt_that_is_not_found(scripted_env):
@@ -329,7 +329,7 @@ def test_the_spec_rebuilds_the_environment():
     env = OptionExecutionWrapper(gym.make("Pendulum-v1"), n_rbf=2, d_max=0.5, reward="integral")
     again = gym.make(env.spec)
     assert isinstance(again, OptionExecutionWrapper)
-    assert again.option_settings == env.option_settings
+    assert again.option_space == env.option_space
     assert again.reward == "integral"
 
 

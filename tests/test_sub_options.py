@@ -57,7 +57,7 @@ def test_accounting_equals_running_the_stretch(scripted_env, end, unit):
             seen_at_end += bool(sub.terminated[i] or sub.truncated[i])
             lengths += last - first
             # What the option vector stands for: the duration, and the actions within the residual
-            settings = env.option_settings
+            settings = env.option_space
             omega, n_steps = settings.decode(sub.options[i])
             assert n_steps == last - first
             plan = env.plan(sub.options[i])

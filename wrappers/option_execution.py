@@ -23,11 +23,11 @@ from sb3_ctco.options import (
     DEFAULT_DISCOUNT_RATE,
     REWARD_UNITS,
     ActionBox,
-    OptionSettings,
+    DurationScale,
+    OptionSpace,
     RewardUnit,
-    action_plan,
+    Trajectory,
     discounts_of_steps,
-    fit_slices,
     integrated_reward,
     step_weight,
 )
@@ -171,6 +171,8 @@ class OptionExecutionWrapper(gym.Wrapper, RecordConstructorArgs):
         ``info["sub_options"]`` (:class:`SubOptions`), for a replay buffer that learns from them
     :param sub_option_tolerance: leave out a sub-option if its actions deviate by more from those that were played;
         actions count as normalised to [−1, 1]
+    :param trajectory: how ω becomes actions, a name in ``sb3_ctco.options.TRAJECTORIES`` or a class
+    :param duration_scale: ``"log"`` or ``"linear"``, see :class:`~sb3_ctco.options.OptionSpace`
     :raises TypeError: if the action space is not a ``Box``
     :raises ValueError: if its bounds are not finite, a setting is out of range, or dt is not given and not found
     """
@@ -189,6 +191,8 @@ class OptionExecutionWrapper(gym.Wrapper, RecordConstructorArgs):
         reward_unit: RewardUnit = "rate",
         n_sub_options: int = 0,
         sub_option_tolerance: float = 0.1,
+        trajectory: str | type[Trajectory] = "rbf",
+        duration_scale: DurationScale = "linear",
     ):
         RecordConstructorArgs.__init__(
             self,
@@ -201,6 +205,8 @@ class OptionExecutionWrapper(gym.Wrapper, RecordConstructorArgs):
             reward_unit=reward_unit,
             n_sub_options=n_sub_options,
             sub_option_tolerance=sub_option_tolerance,
+            trajectory=trajectory,
+            duration_scale=duration_scale,
         )
         gym.Wrapper.__init__(self, env)
 
@@ -228,8 +234,8 @@ class OptionExecutionWrapper(gym.Wrapper, RecordConstructorArgs):
                 "metadata['render_fps']): pass dt, in seconds, to OptionExecutionWrapper"
             )
         #: The settings that a policy for this environment must share.
-        self.option_settings = OptionSettings(
-            n_rbf=n_rbf, d_max=d_max, d_min=dt if d_min is None else d_min, dt=dt, discount_rate=discount_rate
+        self.option_space = OptionSpace.make(
+            n_rbf, d_max, dt if d_min is None else d_min, dt, discount_rate, trajectory, duration_scale
         )
         self.reward: Literal["sum", "integral"] = reward
         self.reward_unit: RewardUnit = reward_unit
@@ -247,7 +253,7 @@ class OptionExecutionWrapper(gym.Wrapper, RecordConstructorArgs):
         self.n_sub_options = 0
         self.set_n_sub_options(n_sub_options)
         self.sub_option_tolerance = sub_option_tolerance
-        self._shortest = math.ceil(self.option_settings.d_min / dt - 1e-6)
+        self._shortest = math.ceil(self.option_space.d_min / dt - 1e-6)
         # A generator of its own, so that sub-options change nothing in what the environment does.
         self._slice_rng = np.random.default_rng()
         self._last_obs: Any = None
@@ -280,9 +286,9 @@ class OptionExecutionWrapper(gym.Wrapper, RecordConstructorArgs):
             raise ResetNeeded("call reset() first: the environment was not reset, its episode ended, or it raised an error")
         play, self._play = self._play, None
 
-        settings = self.option_settings
+        settings = self.option_space
         omega, n_steps = settings.decode(option.clip(-1.0, 1.0))
-        trajectory = action_plan(omega, n_steps)
+        trajectory = settings.trajectory.plan(omega, n_steps)
         slices = self._draw_slices(n_steps)
         observe = sorted({k for ends in slices for k in ends} - {0, n_steps})
         actions = self._box.actions(trajectory)
@@ -334,8 +340,7 @@ class OptionExecutionWrapper(gym.Wrapper, RecordConstructorArgs):
         :param option: shape ``[action_dim · n_rbf + 1]``
         :return: shape ``[n_steps, *action_shape]``
         """
-        omega, n_steps = self.option_settings.decode(np.clip(plain(option), -1.0, 1.0))
-        return self._box.actions(action_plan(omega, n_steps))
+        return self._box.actions(self.option_space.plan(np.clip(plain(option), -1.0, 1.0)))
 
     def _draw_slices(self, n_steps: int) -> list[tuple[int, int]]:
         """Random stretches ``(first step, step after the last)`` of an option, of at least ``d_min``, not all of it."""
@@ -359,13 +364,13 @@ class OptionExecutionWrapper(gym.Wrapper, RecordConstructorArgs):
 
         :param steps: after how many steps of the option each row of ``seen`` was observed
         """
-        settings, n_ran = self.option_settings, len(rewards)
+        settings, n_ran = self.option_space, len(rewards)
         firsts, ends = np.array(slices, dtype=np.int64).reshape(-1, 2).T
         if n_ran < len(trajectory):
             ends = np.minimum(ends, n_ran)
             long_enough = ends - firsts >= self._shortest
             firsts, ends = firsts[long_enough], ends[long_enough]
-        omega, residuals = fit_slices(trajectory, firsts, ends, settings.n_rbf)
+        omega, residuals = settings.trajectory.fit(trajectory, firsts, ends)
         kept = residuals <= self.sub_option_tolerance
         if not kept.all():
             firsts, ends, omega, residuals = firsts[kept], ends[kept], omega[kept], residuals[kept]

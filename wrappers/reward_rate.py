@@ -6,7 +6,7 @@ import gymnasium as gym
 import numpy as np
 from gymnasium.utils import RecordConstructorArgs
 
-from sb3_ctco.options import DEFAULT_DISCOUNT_RATE, OptionSettings, discount, step_weight
+from sb3_ctco.options import DEFAULT_DISCOUNT_RATE, OptionSpace, discount, step_weight
 from sb3_ctco.wrappers.option_execution import find_dt
 
 
@@ -51,7 +51,7 @@ class RewardRateWrapper(gym.Wrapper, RecordConstructorArgs):
                 "metadata['render_fps']): pass dt, in seconds, to RewardRateWrapper"
             )
         #: The clock: a step as an option of one step
-        self.option_settings = OptionSettings(n_rbf=1, d_max=dt, d_min=dt, dt=dt, discount_rate=discount_rate)
+        self.option_space = OptionSpace.make(1, d_max=dt, d_min=dt, dt=dt, discount_rate=discount_rate)
         self.reward_scale = reward_scale
         self._weight = step_weight(dt, discount_rate)
         self._discount = float(discount(dt, discount_rate))
@@ -66,7 +66,7 @@ class RewardRateWrapper(gym.Wrapper, RecordConstructorArgs):
         if not np.isfinite(integral):
             raise ValueError(f"the environment {self.env} returned a reward that is not finite: {reward}")
         info["option"] = {
-            "duration": self.option_settings.dt,
+            "duration": self.option_space.dt,
             "n_steps": 1,
             "integrated_reward": integral,
             "discount": self._discount,

@@ -125,7 +125,7 @@ class _ActionRecorder:
 
     def __post_init__(self) -> None:
         self.actions = [[] for _ in range(self.env.num_envs)]
-        self.is_option_env = self.env.has_attr("option_settings")
+        self.is_option_env = self.env.has_attr("option_space")
         space = self.env.get_attr("primitive_action_space")[0] if self.is_option_env else self.env.action_space
         if not (isinstance(space, spaces.Box) and np.isfinite(space.low).all() and np.isfinite(space.high).all()):
             raise ValueError(f"smoothness is measured of actions in a Box with finite bounds, not in {space}")

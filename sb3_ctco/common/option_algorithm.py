@@ -41,7 +41,7 @@ from sb3_ctco.common.buffers import DictOptionReplayBuffer, OptionReplayBuffer
 from sb3_ctco.common.callbacks import OptionProgressBarCallback, PrimitiveStepCallback, eval_callbacks
 from sb3_ctco.common.vec_env import PLAYED, AsyncOptionVecEnv
 from sb3_ctco.option_array import OptionArray
-from sb3_ctco.options import OptionSettings, discount_rate_from_gamma
+from sb3_ctco.options import DurationScale, OptionSpace, Trajectory, discount_rate_from_gamma
 from sb3_ctco.wrappers import OptionExecutionWrapper, SubOptions, find_dt
 
 SelfOptionOffPolicyAlgorithm = TypeVar("SelfOptionOffPolicyAlgorithm", bound="OptionOffPolicyAlgorithm")
@@ -61,6 +61,8 @@ class OptionOffPolicyAlgorithm(OffPolicyAlgorithm):
     :param d_max: longest duration of an option, in s
     :param d_min: shortest duration, in s; by default one step of the environment
     :param dt: the environment's interaction period, in s; by default found in the environment
+    :param trajectory: how ω becomes actions, a name in ``sb3_ctco.options.TRAJECTORIES`` or a class
+    :param duration_scale: ``"log"`` or ``"linear"``, see :class:`~sb3_ctco.options.OptionSpace`
     :param gamma: discount factor over ``gamma_dt`` seconds, in (0, 1]
     :param gamma_dt: in s
     :param train_freq: collect at least this many primitive steps (in each environment) between trainings
@@ -82,6 +84,8 @@ class OptionOffPolicyAlgorithm(OffPolicyAlgorithm):
         d_max: float,
         d_min: float | None,
         dt: float | None,
+        trajectory: str | type[Trajectory] = "rbf",
+        duration_scale: DurationScale = "linear",
         gamma: float,
         gamma_dt: float,
         updates_per_second: float | None,
@@ -94,6 +98,8 @@ class OptionOffPolicyAlgorithm(OffPolicyAlgorithm):
         self.d_max = d_max
         self.d_min = d_min
         self.dt = dt
+        self.trajectory = trajectory
+        self.duration_scale: DurationScale = duration_scale
         self.gamma = gamma
         self.gamma_dt = gamma_dt
         # An explicit dt stays the user's word on any environment; one that was found must be found again.
@@ -132,7 +138,7 @@ class OptionOffPolicyAlgorithm(OffPolicyAlgorithm):
         )
 
     @property
-    def option_settings(self) -> OptionSettings:
+    def option_space(self) -> OptionSpace:
         """What the policy's option vectors mean.
 
         :raises ValueError: before ``dt`` and ``d_min`` are known, that is without an environment
@@ -142,9 +148,13 @@ class OptionOffPolicyAlgorithm(OffPolicyAlgorithm):
                 f"dt={self.dt} s and d_min={self.d_min} s are found in an environment, and {type(self).__name__} has not "
                 "had one: pass it env, or dt and d_min"
             )
-        return OptionSettings(
-            n_rbf=self.n_rbf, d_max=self.d_max, d_min=self.d_min, dt=self.dt, discount_rate=self.discount_rate
-        )
+        return OptionSpace.make(**{**self._option_arguments, "dt": self.dt, "d_min": self.d_min})
+
+    @property
+    def _option_arguments(self) -> dict[str, Any]:
+        """OptionExecutionWrapper's arguments for the same options, ``dt`` and ``d_min`` as far as they are known."""
+        names = ("n_rbf", "d_max", "d_min", "dt", "trajectory", "duration_scale", "discount_rate")
+        return {name: getattr(self, name) for name in names}
 
     @classmethod
     def wrapper_kwargs(cls, arguments: dict[str, Any]) -> dict[str, Any]:
@@ -152,8 +162,8 @@ class OptionOffPolicyAlgorithm(OffPolicyAlgorithm):
 
         :param arguments: the algorithm's arguments, defaults included
         """
-        kwargs = {name: arguments[name] for name in ("n_rbf", "d_max", "d_min", "dt")}
-        kwargs["n_sub_options"] = arguments.get("n_sub_options", 0)
+        names = ("n_rbf", "d_max", "d_min", "dt", "trajectory", "duration_scale", "n_sub_options")
+        kwargs = {name: arguments[name] for name in names if name in arguments}
         return {**kwargs, "discount_rate": discount_rate_from_gamma(arguments["gamma"], arguments["gamma_dt"])}
 
     def wrap_env(self, env: gym.Env, n_sub_options: int = 0) -> OptionExecutionWrapper:
@@ -166,15 +176,7 @@ class OptionOffPolicyAlgorithm(OffPolicyAlgorithm):
         dt = self.dt if self._dt_was_given else (find_dt(env) or self.dt)
         if unwrap_wrapper(env, Monitor) is None:
             env = Monitor(env)
-        return OptionExecutionWrapper(
-            env,
-            n_rbf=self.n_rbf,
-            d_max=self.d_max,
-            d_min=self.d_min,
-            dt=dt,
-            discount_rate=self.discount_rate,
-            n_sub_options=n_sub_options,
-        )
+        return OptionExecutionWrapper(env, **{**self._option_arguments, "dt": dt}, n_sub_options=n_sub_options)
 
     def _as_option_env(self, env: GymEnv) -> GymEnv:
         if isinstance(env, VecEnv):
@@ -211,7 +213,7 @@ class OptionOffPolicyAlgorithm(OffPolicyAlgorithm):
         self._check_settings(env)
         return env
 
-    def _check_env(self, env: VecEnv) -> OptionSettings:
+    def _check_env(self, env: VecEnv) -> OptionSpace:
         """The options' settings of an environment, once they agree with the algorithm's."""
         normalizer = unwrap_vec_normalize(env)
         if normalizer is not None and normalizer.norm_reward:
@@ -238,23 +240,17 @@ class OptionOffPolicyAlgorithm(OffPolicyAlgorithm):
         env.env_method("set_n_sub_options", self.n_sub_options)
         return settings
 
-    def _check_settings(self, env: VecEnv) -> OptionSettings:
+    def _check_settings(self, env: VecEnv) -> OptionSpace:
         """The options' settings of an environment, once options mean the same in it as to the algorithm."""
-        settings: list[OptionSettings] = env.get_attr("option_settings")
-        expected = {
-            "n_rbf": self.n_rbf,
-            "d_max": self.d_max,
-            "d_min": settings[0].d_min if self.d_min is None else self.d_min,
-            "dt": settings[0].dt if self.dt is None else self.dt,
-            "discount_rate": self.discount_rate,
-        }
+        settings: list[OptionSpace] = env.get_attr("option_space")
+        known = {name: value for name, value in self._option_arguments.items() if value is not None}
+        expected = OptionSpace.make(**{**settings[0].arguments, **known})
         for one in settings:
-            for name, value in expected.items():
-                if not np.isclose(getattr(one, name), value, rtol=1e-6, atol=0.0):
-                    raise ValueError(
-                        f"the environment's options have {name}={getattr(one, name)}, {type(self).__name__} has "
-                        f"{name}={value}: give both the same (discount_rate is -ln(gamma)/gamma_dt)"
-                    )
+            for name, (value, found) in expected.differences(one).items():
+                raise ValueError(
+                    f"the environment's options have {name}={found}, {type(self).__name__} has "
+                    f"{name}={value}: give both the same (discount_rate is -ln(gamma)/gamma_dt)"
+                )
         action_spaces: list[spaces.Box] = env.get_attr("primitive_action_space")
         for space in action_spaces:
             if space != (self.primitive_action_space or action_spaces[0]):

@@ -23,7 +23,7 @@ from sb3_ctco.figar_sac.policies import (
     decode_repetitions,
     encode_repetitions,
 )
-from sb3_ctco.options import OptionSettings, steps_in
+from sb3_ctco.options import OptionSpace, steps_in
 from sb3_ctco.wrappers import OptionExecutionWrapper, find_dt
 
 SelfFiGARSAC = TypeVar("SelfFiGARSAC", bound="FiGARSAC")
@@ -215,7 +215,7 @@ class FiGARSAC(SoftOptionActorCritic):
             )
         if d_max is None:
             d_max = (20 if n_repetitions is None else n_repetitions) * dt
-        return super().wrapper_kwargs({**arguments, "n_rbf": 1, "d_max": d_max, "d_min": None})
+        return super().wrapper_kwargs({**arguments, "n_rbf": 1, "d_max": d_max, "d_min": None, "duration_scale": "linear"})
 
     def _resolve_repetitions(self, dt: float) -> None:
         """Make ``n_repetitions`` and ``d_max``, of which the user gave one, say the same at the first dt that is known."""
@@ -241,12 +241,12 @@ class FiGARSAC(SoftOptionActorCritic):
         if self.dt is not None:
             self._resolve_repetitions(self.dt)
         elif isinstance(env, VecEnv):
-            self._resolve_repetitions(env.get_attr("option_settings")[0].dt)
+            self._resolve_repetitions(env.get_attr("option_space")[0].dt)
         else:
-            self._resolve_repetitions(env.get_wrapper_attr("option_settings").dt)
+            self._resolve_repetitions(env.get_wrapper_attr("option_space").dt)
         return env
 
-    def _check_env(self, env: VecEnv) -> OptionSettings:
+    def _check_env(self, env: VecEnv) -> OptionSpace:
         settings = super()._check_env(env)
         if not np.isclose(settings.d_min, settings.dt, rtol=1e-6, atol=0.0):
             raise ValueError(
