@@ -1,10 +1,9 @@
 """The base of off-policy algorithms that decide by options: environments, replay buffer, time accounting."""
 
-import dataclasses
 import io
 import pathlib
 import warnings
-from typing import Any, TypeVar
+from typing import Any, ClassVar, TypeVar
 
 import gymnasium as gym
 import numpy as np
@@ -39,10 +38,11 @@ from stable_baselines3.common.vec_env import (
 
 from sb3_ctco.common.buffers import DictOptionReplayBuffer, OptionReplayBuffer
 from sb3_ctco.common.callbacks import OptionProgressBarCallback, PrimitiveStepCallback, eval_callbacks
+from sb3_ctco.common.load_arguments import check_load_arguments
 from sb3_ctco.common.vec_env import PLAYED, AsyncOptionVecEnv
 from sb3_ctco.option_array import OptionArray
 from sb3_ctco.options import DurationScale, OptionSpace, Trajectory, discount_rate_from_gamma
-from sb3_ctco.wrappers import OptionExecutionWrapper, SubOptions, find_dt
+from sb3_ctco.wrappers import OptionExecutionWrapper, find_dt
 
 SelfOptionOffPolicyAlgorithm = TypeVar("SelfOptionOffPolicyAlgorithm", bound="OptionOffPolicyAlgorithm")
 
@@ -73,6 +73,18 @@ class OptionOffPolicyAlgorithm(OffPolicyAlgorithm):
         are wrapped already are told
     :raises ValueError: for settings out of range or contradicting each other or the environment's
     """
+
+    #: Arguments that ``load`` cannot change: what options mean, and what was learned or decides what is saved
+    _kept_when_loaded: ClassVar[tuple[str, ...]] = (
+        "n_rbf",
+        "d_max",
+        "d_min",
+        "dt",
+        "n_repetitions",
+        "ent_coef",
+        "duration_ent_coef",
+        "target_decision_rate",
+    )
 
     def __init__(
         self,
@@ -282,8 +294,18 @@ class OptionOffPolicyAlgorithm(OffPolicyAlgorithm):
     ) -> SelfOptionOffPolicyAlgorithm:
         """Stable-Baselines3's ``load``; a bare environment is wrapped with the settings in the file.
 
-        :raises ValueError: if the environment's settings differ from the file's
+        :param kwargs: arguments of the constructor to change, such as ``learning_rate``, ``buffer_size`` or ``gamma``; not
+            those that options or networks depend on (``n_rbf``, ``d_max``, ``d_min``, ``dt``, ``policy_kwargs``), and
+            not the temperatures, which are learned and saved
+        :raises TypeError: for an argument that the constructor does not have
+        :raises ValueError: if the environment's settings differ from the file's, or an argument that cannot be changed
         """
+        kwargs = check_load_arguments(cls, path, kwargs, cls._kept_when_loaded)
+        # Of two that say the same in different ways, the one that is given holds.
+        if "gradient_steps" in kwargs:
+            kwargs.setdefault("updates_per_second", None)
+        elif kwargs.get("updates_per_second") is not None:
+            kwargs["gradient_steps"] = -1
         if env is not None:
             kwargs["n_envs"] = env.num_envs if isinstance(env, VecEnv) else 1
         model = super().load(path, None, device, custom_objects, print_system_info, force_reset, **kwargs)
@@ -307,6 +329,8 @@ class OptionOffPolicyAlgorithm(OffPolicyAlgorithm):
                 f"replay_buffer_class must be OptionReplayBuffer, DictOptionReplayBuffer or a subclass, not "
                 f"{self.replay_buffer_class.__name__}, which does not keep the durations of options"
             )
+        # Once more, since load may have changed gamma.
+        self.discount_rate = discount_rate_from_gamma(self.gamma, self.gamma_dt)
         self.replay_buffer_kwargs = {**self.replay_buffer_kwargs, "discount_rate": self.discount_rate}
         if self.env is not None:
             settings = self._check_env(self.env)
@@ -374,22 +398,25 @@ class OptionOffPolicyAlgorithm(OffPolicyAlgorithm):
         dones: np.ndarray,
         infos: list[dict[str, Any]],
     ) -> None:
+        # A copy, since the caller's array may be the one that the environment is given.
+        buffer_action = buffer_action.copy()
         for i, info in enumerate(infos):
-            if "sub_options" in info:
-                self._residuals_since_log.extend(info["sub_options"].residuals)
-                info["sub_options"] = self._as_stored(info["sub_options"])
             if PLAYED in info:
                 buffer_action[i] = self.policy.scale_action(info[PLAYED])
+        self._see_what_ran(buffer_action, infos)
         super()._store_transition(replay_buffer, buffer_action, new_obs, reward, dones, infos)
-        self._durations_since_log.extend(info["option"]["duration"] for info in infos if "option" in info)
+        for info in infos:
+            if "option" in info:
+                self._durations_since_log.append(info["option"]["duration"])
+            if "sub_options" in info:
+                self._residuals_since_log.extend(info["sub_options"].residuals)
 
-    def _as_stored(self, sub_options: SubOptions) -> SubOptions:
-        """Sub-options come past the wrappers of the VecEnv, of which VecTransposeImage changes what is stored."""
-        assert self.env is not None
-        transpose = unwrap_vec_wrapper(self.env, VecTransposeImage)
-        if transpose is None:
-            return sub_options
-        return dataclasses.replace(sub_options, seen=transpose.transpose_observations(sub_options.seen))
+    def _see_what_ran(self, options: np.ndarray, infos: list[dict[str, Any]]) -> None:
+        """Adapt options to what ran of them, in place, before they are stored; a subclass may need to.
+
+        :param options: normalised, ``[n_envs, option_dim]``
+        :param infos: each with ``info["option"]``, unless its option runs on
+        """
 
     def dump_logs(self) -> None:
         """Write log data; also the durations of options, their mean and the decision rate since the last time."""

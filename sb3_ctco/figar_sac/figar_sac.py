@@ -274,21 +274,13 @@ class FiGARSAC(SoftOptionActorCritic):
             action[:, -1] = buffer_action[:, -1] = encode_repetitions(index + 1.0, self.n_repetitions)
         return action, buffer_action
 
-    def _store_transition(
-        self,
-        replay_buffer: ReplayBuffer,
-        buffer_action: np.ndarray,
-        new_obs: np.ndarray | dict[str, np.ndarray],
-        reward: np.ndarray,
-        dones: np.ndarray,
-        infos: list[dict[str, Any]],
-    ) -> None:
+    def _see_what_ran(self, options: np.ndarray, infos: list[dict[str, Any]]) -> None:
         # What ran is what was asked for, unless the episode's end cut it short: then it equals a shorter repetition.
         assert self.n_repetitions is not None
-        n_steps = np.array([info["option"]["n_steps"] for info in infos], dtype=np.float32)
-        buffer_action = buffer_action.copy()
-        buffer_action[:, -1] = encode_repetitions(n_steps, self.n_repetitions)
-        super()._store_transition(replay_buffer, buffer_action, new_obs, reward, dones, infos)
+        for option, info in zip(options, infos, strict=True):
+            if "option" in info:
+                n_steps = np.array(info["option"]["n_steps"], dtype=np.float32)
+                option[-1] = encode_repetitions(n_steps, self.n_repetitions)
 
     def _sample_policy(self, obs: PyTorchObs) -> tuple[th.Tensor, ...]:
         actions, action_log_prob, repetition_log_probs = self.actor.action_log_prob(obs)
