@@ -18,6 +18,9 @@ from sb3_ctco.wrappers import SubOptions
 class _OptionStorage(ReplayBuffer):
     """What the two option buffers add to their Stable-Baselines3 base."""
 
+    #: Of buffers that were saved without one
+    reward_scale = 1.0
+
     def __init__(
         self,
         buffer_size: int,
@@ -28,6 +31,7 @@ class _OptionStorage(ReplayBuffer):
         optimize_memory_usage: bool = False,
         handle_timeout_termination: bool = True,
         discount_rate: float = DEFAULT_DISCOUNT_RATE,
+        reward_scale: float = 1.0,
     ):
         if optimize_memory_usage:
             raise ValueError(
@@ -45,6 +49,7 @@ class _OptionStorage(ReplayBuffer):
             handle_timeout_termination=handle_timeout_termination,
         )
         self.discount_rate = float(discount_rate)
+        self.reward_scale = float(reward_scale)
         self.durations = np.zeros((self.buffer_size, self.n_envs), dtype=np.float32)
         self.integrated_rewards = np.zeros((self.buffer_size, self.n_envs), dtype=np.float32)
         #: How many decisions were ever added (without sub-options), and how long their options took, in s.
@@ -158,7 +163,7 @@ class _OptionStorage(ReplayBuffer):
             "actions": self._tensor(rows(self.actions)),
             "next_observations": observations(self.next_observations),
             "dones": self._tensor(dones[:, None]),
-            "rewards": self._tensor(rows(self.integrated_rewards)[:, None]),
+            "rewards": self._tensor(rows(self.integrated_rewards)[:, None]) * self.reward_scale,
             "discounts": self._tensor(discount(rows(self.durations), self.discount_rate)[:, None]),
         }
 
@@ -215,11 +220,13 @@ class OptionReplayBuffer(_OptionStorage):
     """Stable-Baselines3's ``ReplayBuffer`` for options.
 
     Beside its fields it keeps ``durations`` (time that ran, s) and ``integrated_rewards`` (R). All have the shape
-    ``[buffer_size, 1, ...]`` with one row a transition, whichever environment it is from. A sample has R as ``rewards``
-    and e^(−τ·duration) as ``discounts``, which SAC and TD3 use as they are: with this buffer and an environment wrapped
-    in :class:`~sb3_ctco.wrappers.OptionExecutionWrapper` they learn on the semi-Markov process.
+    ``[buffer_size, 1, ...]`` with one row a transition, whichever environment it is from. A sample has R, times
+    ``reward_scale``, as ``rewards`` and e^(−τ·duration) as ``discounts``, which SAC and TD3 use as they are: with this buffer
+    and an environment wrapped in :class:`~sb3_ctco.wrappers.OptionExecutionWrapper` they learn on the semi-Markov process.
 
     :param discount_rate: τ, in 1/s; the wrapper's
+    :param reward_scale: what R is multiplied by in samples; ``1/step_weight(dt, discount_rate)`` gives R the unit of a reward
+        of 1 over ``dt``, so that an option of one step is worth to a stock algorithm what a step is
     :raises ValueError: if ``optimize_memory_usage`` is asked for
     """
 

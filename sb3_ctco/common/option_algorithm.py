@@ -1,9 +1,10 @@
 """The base of off-policy algorithms that decide by options: environments, replay buffer, time accounting."""
 
 import io
+import math
 import pathlib
 import warnings
-from typing import Any, ClassVar, TypeVar
+from typing import Any, ClassVar, Literal, TypeVar
 
 import gymnasium as gym
 import numpy as np
@@ -41,7 +42,7 @@ from sb3_ctco.common.callbacks import OptionProgressBarCallback, PrimitiveStepCa
 from sb3_ctco.common.load_arguments import check_load_arguments
 from sb3_ctco.common.vec_env import PLAYED, AsyncOptionVecEnv
 from sb3_ctco.option_array import OptionArray
-from sb3_ctco.options import DurationScale, OptionSpace, Trajectory, discount_rate_from_gamma
+from sb3_ctco.options import DurationScale, OptionSpace, Trajectory, discount_rate_from_gamma, step_weight
 from sb3_ctco.wrappers import OptionExecutionWrapper, find_dt
 
 SelfOptionOffPolicyAlgorithm = TypeVar("SelfOptionOffPolicyAlgorithm", bound="OptionOffPolicyAlgorithm")
@@ -63,6 +64,8 @@ class OptionOffPolicyAlgorithm(OffPolicyAlgorithm):
     :param dt: the environment's interaction period, in s; by default found in the environment
     :param trajectory: how ω becomes actions, a name in ``sb3_ctco.options.TRAJECTORIES`` or a class
     :param duration_scale: ``"log"`` or ``"linear"``, see :class:`~sb3_ctco.options.OptionSpace`
+    :param reward_scale: what R is multiplied by for the critics, or ``"gamma_dt"`` for the unit of a reward of 1 over
+        ``gamma_dt``
     :param gamma: discount factor over ``gamma_dt`` seconds, in (0, 1]
     :param gamma_dt: in s
     :param train_freq: collect at least this many primitive steps (in each environment) between trainings
@@ -79,7 +82,9 @@ class OptionOffPolicyAlgorithm(OffPolicyAlgorithm):
         "n_rbf",
         "d_max",
         "d_min",
-        "dt",
+        "trajectory",
+        "duration_scale",
+        "reward_scale",
         "n_repetitions",
         "ent_coef",
         "duration_ent_coef",
@@ -98,6 +103,7 @@ class OptionOffPolicyAlgorithm(OffPolicyAlgorithm):
         dt: float | None,
         trajectory: str | type[Trajectory] = "rbf",
         duration_scale: DurationScale = "linear",
+        reward_scale: float | Literal["gamma_dt"] = 1.0,
         gamma: float,
         gamma_dt: float,
         updates_per_second: float | None,
@@ -112,12 +118,15 @@ class OptionOffPolicyAlgorithm(OffPolicyAlgorithm):
         self.dt = dt
         self.trajectory = trajectory
         self.duration_scale: DurationScale = duration_scale
+        self.reward_scale: float | Literal["gamma_dt"] = reward_scale
         self.gamma = gamma
         self.gamma_dt = gamma_dt
         # An explicit dt stays the user's word on any environment; one that was found must be found again.
         self._dt_was_given = dt is not None
         #: τ, in 1/s
         self.discount_rate = discount_rate_from_gamma(gamma, gamma_dt)
+        if reward_scale != "gamma_dt" and not (isinstance(reward_scale, int | float) and 0 < reward_scale < math.inf):
+            raise ValueError(f"reward_scale must be a positive number or 'gamma_dt', not {reward_scale!r}")
         if updates_per_second is not None:
             if gradient_steps != -1:
                 raise ValueError(
@@ -295,7 +304,7 @@ class OptionOffPolicyAlgorithm(OffPolicyAlgorithm):
         """Stable-Baselines3's ``load``; a bare environment is wrapped with the settings in the file.
 
         :param kwargs: arguments of the constructor to change, such as ``learning_rate``, ``buffer_size`` or ``gamma``; not
-            those that options or networks depend on (``n_rbf``, ``d_max``, ``d_min``, ``dt``, ``policy_kwargs``), and
+            those that options or networks depend on (such as ``n_rbf``, ``d_max``, ``d_min``, ``policy_kwargs``), and
             not the temperatures, which are learned and saved
         :raises TypeError: for an argument that the constructor does not have
         :raises ValueError: if the environment's settings differ from the file's, or an argument that cannot be changed
@@ -331,11 +340,32 @@ class OptionOffPolicyAlgorithm(OffPolicyAlgorithm):
             )
         # Once more, since load may have changed gamma.
         self.discount_rate = discount_rate_from_gamma(self.gamma, self.gamma_dt)
-        self.replay_buffer_kwargs = {**self.replay_buffer_kwargs, "discount_rate": self.discount_rate}
+        scale = 1.0 / step_weight(self.gamma_dt, self.discount_rate) if self.reward_scale == "gamma_dt" else self.reward_scale
+        self.replay_buffer_kwargs = {
+            **self.replay_buffer_kwargs,
+            "discount_rate": self.discount_rate,
+            "reward_scale": scale,
+        }
         if self.env is not None:
             settings = self._check_env(self.env)
             self.dt, self.d_min = settings.dt, settings.d_min
         super()._setup_model()
+
+    def load_replay_buffer(self, path: str | pathlib.Path | io.BufferedIOBase, truncate_last_traj: bool = True) -> None:
+        """Stable-Baselines3's; what is in the buffer is scaled as this algorithm scales rewards.
+
+        :raises ValueError: if its options were discounted at another rate
+        """
+        super().load_replay_buffer(path, truncate_last_traj)
+        buffer = self.replay_buffer
+        assert isinstance(buffer, OptionReplayBuffer | DictOptionReplayBuffer)
+        if not math.isclose(buffer.discount_rate, self.discount_rate, rel_tol=1e-6):
+            self.replay_buffer = None
+            raise ValueError(
+                f"the replay buffer in {path} has discount_rate={buffer.discount_rate}, {type(self).__name__} has "
+                f"discount_rate={self.discount_rate}: load it into a model with the same gamma and gamma_dt"
+            )
+        buffer.reward_scale = self.replay_buffer_kwargs["reward_scale"]
 
     def _init_callback(self, callback: MaybeCallback, progress_bar: bool = False) -> BaseCallback:
         if isinstance(callback, list):
