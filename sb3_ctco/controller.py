@@ -91,7 +91,9 @@ class OnnxPolicy:
         try:
             import onnxruntime  # noqa: PLC0415
         except ImportError as error:
-            raise ImportError("running an exported policy needs onnxruntime: pip install 'sb3-ctco[onnx]'") from error
+            raise ImportError(
+                "running an exported policy needs onnxruntime: in a clone of sb3-ctco, run pip install '.[onnx]'"
+            ) from error
         options = onnxruntime.SessionOptions()
         options.intra_op_num_threads = n_threads
         self._session = onnxruntime.InferenceSession(str(path), options, providers=["CPUExecutionProvider"])

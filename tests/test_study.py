@@ -16,6 +16,7 @@ import matplotlib as mpl
 import numpy as np
 import pytest
 import yaml
+from conftest import PATIENCE
 from rliable.metrics import aggregate_iqm
 
 from sb3_ctco.registry import ALGORITHMS as ALGORITHM_ROWS
@@ -63,8 +64,8 @@ def few_resamples(monkeypatch):
     monkeypatch.setattr(plots, "_BOOTSTRAP_REPETITIONS", 50)
 
 
-def wait_for(condition, seconds: float = 60.0) -> None:
-    end = time.monotonic() + seconds
+def wait_for(condition) -> None:
+    end = time.monotonic() + PATIENCE
     while not condition():
         assert time.monotonic() < end, "it did not happen"
         time.sleep(0.02)
@@ -272,11 +273,12 @@ def test_two_studies_on_one_folder(finished, tmp_path, capsys):
     assert not runs.is_running(first)
 
 
+@pytest.mark.slow
 def test_two_studies_at_once_make_each_run_once(tmp_path):
     preset, folder = tiny(tmp_path, seeds=3), tmp_path / "study"
     arguments = [*COMMAND, "run", "--preset", preset, "--folder", str(folder), "--workers", "1"]
     studies = [subprocess.Popen(arguments, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True) for _ in range(2)]
-    outputs = [study.communicate(timeout=120)[0] for study in studies]
+    outputs = [study.communicate(timeout=PATIENCE)[0] for study in studies]
     assert {study.returncode for study in studies} <= {0, 3}, outputs
     assert len(list(folder.glob("*/record.json"))) == 3
     for file in folder.glob("*/monitor.csv"):
@@ -285,6 +287,7 @@ def test_two_studies_at_once_make_each_run_once(tmp_path):
         assert len(seconds) == 10
 
 
+@pytest.mark.slow
 def test_kill_9_loses_only_the_runs_in_flight(tmp_path):
     preset, folder = tiny(tmp_path, seeds=6), tmp_path / "study"
     arguments = ["run", "--preset", preset, "--folder", str(folder), "--workers", "2"]
@@ -293,7 +296,7 @@ def test_kill_9_loses_only_the_runs_in_flight(tmp_path):
     study.send_signal(signal.SIGKILL)
     study.wait()
     # Its workers see at the end of an episode that nobody waits for them.
-    wait_for(lambda: not any(runs.is_running(path) for path in folder.iterdir()), 30)
+    wait_for(lambda: not any(runs.is_running(path) for path in folder.iterdir()))
     done = {file: file.stat().st_mtime_ns for file in folder.glob("*/record.json")}
     assert 2 <= len(done) < 6
     assert main(arguments) == 0
@@ -301,12 +304,13 @@ def test_kill_9_loses_only_the_runs_in_flight(tmp_path):
     assert {file: file.stat().st_mtime_ns for file in done} == done
 
 
+@pytest.mark.slow
 def test_a_worker_that_dies_is_replaced(tmp_path):
     preset, folder = tiny(tmp_path, seeds=4), tmp_path / "study"
     arguments = ["run", "--preset", preset, "--folder", str(folder), "--workers", "2"]
     study = subprocess.Popen([*COMMAND, *arguments], stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
     os.kill(worker_at_work(study.pid, folder), signal.SIGKILL)
-    assert study.wait(timeout=120) == 0
+    assert study.wait(timeout=PATIENCE) == 0
     assert len(list(folder.glob("*/record.json"))) == 4
 
 
@@ -317,7 +321,7 @@ def test_ray_ends_a_study_although_a_worker_is_killed(tmp_path):
     arguments = ["run", "--preset", preset, "--folder", str(folder), "--workers", "2", "--engine", "ray"]
     study = subprocess.Popen([*COMMAND, *arguments], stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
     os.kill(worker_at_work(study.pid, folder), signal.SIGKILL)
-    assert study.wait(timeout=120) == 0
+    assert study.wait(timeout=PATIENCE) == 0
     assert len(list(folder.glob("*/record.json"))) == 3
 
 

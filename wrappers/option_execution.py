@@ -296,7 +296,8 @@ class OptionExecutionWrapper(gym.Wrapper, RecordConstructorArgs):
         if dt is None:
             raise ValueError(
                 f"{env} does not tell its interaction period (no unwrapped.dt, control_timestep() or "
-                "metadata['render_fps']): pass dt, in seconds, to OptionExecutionWrapper"
+                "metadata['render_fps']): pass dt, in seconds, to the algorithm, CTCO(..., dt=0.02), or to "
+                "OptionExecutionWrapper(env, dt=0.02)"
             )
         #: The settings that a policy for this environment must share.
         self.option_space = OptionSpace.make(

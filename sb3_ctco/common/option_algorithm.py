@@ -1,9 +1,11 @@
 """The base of off-policy algorithms that decide by options: environments, replay buffer, time accounting."""
 
 import io
+import json
 import math
 import pathlib
 import warnings
+import zipfile
 from typing import Any, ClassVar, Literal, TypeVar
 
 import gymnasium as gym
@@ -18,6 +20,7 @@ from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.noise import ActionNoise
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.policies import BasePolicy
+from stable_baselines3.common.save_util import open_path
 from stable_baselines3.common.type_aliases import (
     GymEnv,
     MaybeCallback,
@@ -90,6 +93,8 @@ class OptionOffPolicyAlgorithm(OffPolicyAlgorithm):
         "duration_ent_coef",
         "target_decision_rate",
     )
+    #: An attribute that this class's files have and others' have not
+    _own_setting: ClassVar[str] = "discount_rate"
 
     def __init__(
         self,
@@ -307,8 +312,10 @@ class OptionOffPolicyAlgorithm(OffPolicyAlgorithm):
             those that options or networks depend on (such as ``n_rbf``, ``d_max``, ``d_min``, ``policy_kwargs``), and
             not the temperatures, which are learned and saved
         :raises TypeError: for an argument that the constructor does not have
-        :raises ValueError: if the environment's settings differ from the file's, or an argument that cannot be changed
+        :raises ValueError: if the environment's settings differ from the file's, for an argument that cannot be changed, or if
+            another algorithm wrote the file
         """
+        cls._refuse_files_of_others(path)
         kwargs = check_load_arguments(cls, path, kwargs, cls._kept_when_loaded)
         # Of two that say the same in different ways, the one that is given holds.
         if "gradient_steps" in kwargs:
@@ -324,6 +331,20 @@ class OptionOffPolicyAlgorithm(OffPolicyAlgorithm):
             if model.seed is not None:
                 model.env.seed(model.seed)  # type: ignore[union-attr]
         return model
+
+    @classmethod
+    def _refuse_files_of_others(cls, path: str | pathlib.Path | io.BufferedIOBase) -> None:
+        file = open_path(path, "r", verbose=0, suffix="zip")
+        attributes = json.loads(zipfile.ZipFile(file).read("data")) if zipfile.is_zipfile(file) else {}
+        if file is path:
+            file.seek(0)
+        else:
+            file.close()
+        writer = attributes.get("policy_class", {}).get("__module__", "an unknown module")
+        if attributes and cls._own_setting not in attributes:
+            raise ValueError(
+                f"{path} was not saved by {cls.__name__}: its policy is from {writer}. Load it with the class that saved it"
+            )
 
     def _setup_model(self) -> None:
         if self.n_steps != 1:
@@ -350,6 +371,23 @@ class OptionOffPolicyAlgorithm(OffPolicyAlgorithm):
             settings = self._check_env(self.env)
             self.dt, self.d_min = settings.dt, settings.d_min
         super()._setup_model()
+        self._warn_of_a_large_buffer()
+
+    def _warn_of_a_large_buffer(self) -> None:
+        buffer, available = self.replay_buffer, _available_memory()
+        if not isinstance(buffer, OptionReplayBuffer | DictOptionReplayBuffer) or available is None:
+            return
+        planned = buffer.bytes_per_transition * buffer.buffer_size
+        if planned <= available:
+            return
+        decisions = buffer.buffer_size // (1 + self.n_sub_options)
+        span = "" if self.d_min is None else f", {decisions * self.d_min:,.0f} to {decisions * self.d_max:,.0f} s of task time"
+        warnings.warn(
+            f"buffer_size={buffer.buffer_size:,} plans {planned / 1e9:.1f} GB of memory, and {available / 1e9:.1f} GB are "
+            f"available: pass a smaller one, {available // 2 // buffer.bytes_per_transition:,} for half of that. With "
+            f"n_sub_options={self.n_sub_options} this buffer holds at least {decisions:,} decisions{span}",
+            stacklevel=4,
+        )
 
     def load_replay_buffer(self, path: str | pathlib.Path | io.BufferedIOBase, truncate_last_traj: bool = True) -> None:
         """Stable-Baselines3's; what is in the buffer is scaled as this algorithm scales rewards.
@@ -480,6 +518,15 @@ class OptionOffPolicyAlgorithm(OffPolicyAlgorithm):
         """
         options, state = super().predict(observation, state, episode_start, deterministic)
         return options.view(OptionArray), state
+
+
+def _available_memory() -> int | None:
+    """Memory that can be had without swapping, in bytes, on Linux; elsewhere None, and Stable-Baselines3 asks psutil."""
+    try:
+        lines = pathlib.Path("/proc/meminfo").read_text().splitlines()
+    except OSError:
+        return None
+    return next((1024 * int(line.split()[1]) for line in lines if line.startswith("MemAvailable:")), None)
 
 
 def _warn_of_outer_monitors(env: GymEnv) -> None:

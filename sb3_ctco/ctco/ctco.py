@@ -129,6 +129,8 @@ class CTCO(SoftOptionActorCritic):
     :raises ValueError: for settings out of range, or that contradict the environment's
     """
 
+    _own_setting: ClassVar[str] = "high_freq_penalty"
+
     policy_aliases: ClassVar[dict[str, type[BasePolicy]]] = {
         "MlpPolicy": MlpPolicy,
         "CnnPolicy": CnnPolicy,

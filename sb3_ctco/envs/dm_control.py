@@ -1,5 +1,7 @@
 """Every task of dm_control's suite at any control period, as a Gymnasium environment that can play whole options."""
 
+import contextlib
+import logging
 import math
 import warnings
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -21,7 +23,7 @@ try:
         from dm_control import suite
         from dm_control.rl.control import PhysicsError
 except ImportError as error:  # pragma: no cover
-    raise ImportError("this environment needs dm_control: pip install 'sb3-ctco[dm-control]'") from error
+    raise ImportError("this environment needs dm_control: in a clone of sb3-ctco, run pip install '.[dm-control]'") from error
 
 #: Rewards ``[n_steps]`` from the qpos, sensordata and ctrl that steps led to, ``[n_steps, ...]`` each
 Rewards = Callable[[np.ndarray, np.ndarray, np.ndarray], np.ndarray]
@@ -80,8 +82,9 @@ class DMControlEnv(gym.Env[np.ndarray, np.ndarray]):
             raise ValueError(f"render_mode must be None or 'rgb_array', not {render_mode!r}")
         if sparse and domain not in _SPARSE_REWARDS:
             raise ValueError(f"{domain} has no sparse reward here; these domains have one: {sorted(_SPARSE_REWARDS)}")
-        # Some models are drawn at random (lqr's): the same one each time. What reset draws follows from its seed.
-        env = suite.load(domain, task, task_kwargs={"random": 0})
+        with _without_deprecations():
+            # Some models are drawn at random (lqr's): the same one each time. What reset draws follows from its seed.
+            env = suite.load(domain, task, task_kwargs={"random": 0})
         self._task = env.task
         self._physics = env.physics
         self._model: mujoco.MjModel = env.physics.model.ptr
@@ -233,6 +236,21 @@ class DMControlEnv(gym.Env[np.ndarray, np.ndarray]):
             return np.concatenate(joints, dtype=np.float32, casting="same_kind")
         leaves = [np.ravel(value) for value in _leaves(self._task.get_observation(self._physics))]
         return np.concatenate(leaves, dtype=np.float32, casting="same_kind")
+
+
+@contextlib.contextmanager
+def _without_deprecations() -> Iterator[None]:
+    """Keep to itself what MuJoCo says of attributes in dm_control's own models, which its users cannot change."""
+    logger = logging.getLogger("absl")
+
+    def is_wanted(record: logging.LogRecord) -> bool:
+        return "'settotalmass' is deprecated" not in record.getMessage()
+
+    logger.addFilter(is_wanted)
+    try:
+        yield
+    finally:
+        logger.removeFilter(is_wanted)
 
 
 def _leaves(observation: Mapping[str, Any]) -> Iterator[Any]:

@@ -108,6 +108,8 @@ class FiGARSAC(SoftOptionActorCritic):
     :raises TypeError: if ``n_repetitions`` is not an integer
     """
 
+    _own_setting: ClassVar[str] = "n_repetitions"
+
     policy_aliases: ClassVar[dict[str, type[BasePolicy]]] = {
         "MlpPolicy": MlpPolicy,
         "CnnPolicy": CnnPolicy,

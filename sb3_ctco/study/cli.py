@@ -23,6 +23,12 @@ def main(arguments: Sequence[str] | None = None) -> int:
     args = _parser().parse_args(arguments)
     try:
         return args.call(args)
+    except ModuleNotFoundError as error:
+        print(
+            f"sb3-ctco study {args.command}: {(error.name or str(error)).partition('.')[0]} is missing: in a clone of sb3-ctco, run pip install '.[study]'",
+            file=sys.stderr,
+        )
+        return FAILED
     except (ValueError, ImportError) as error:
         print(f"sb3-ctco study {args.command}: {error}", file=sys.stderr)
         return FAILED

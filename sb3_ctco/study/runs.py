@@ -2,18 +2,19 @@
 
 import contextlib
 import csv
-import fcntl
+import errno
 import json
 import os
 import platform
 import subprocess
+import sys
 import time
 import traceback
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from importlib import metadata
 from pathlib import Path
-from typing import Any, Literal
+from typing import IO, Any, Literal
 
 import numpy as np
 import torch as th
@@ -114,8 +115,10 @@ def lock(path: Path, patience: float = 0.5) -> Iterator[bool]:
         end = time.monotonic() + patience
         while True:
             try:
-                fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-            except BlockingIOError:
+                _flock(file)
+            except OSError as error:
+                if error.errno not in (errno.EAGAIN, errno.EACCES, errno.EDEADLOCK):
+                    raise
                 if time.monotonic() >= end:
                     yield False
                     return
@@ -123,6 +126,19 @@ def lock(path: Path, patience: float = 0.5) -> Iterator[bool]:
             else:
                 yield True
                 return
+
+
+def _flock(file: IO[str]) -> None:
+    """Lock a file as a whole, or raise an ``OSError`` if another process has."""
+    if sys.platform == "win32":
+        import msvcrt  # noqa: PLC0415
+
+        file.seek(0)
+        msvcrt.locking(file.fileno(), msvcrt.LK_NBLCK, 1)
+    else:
+        import fcntl  # noqa: PLC0415
+
+        fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
 
 
 def is_running(path: Path) -> bool:
