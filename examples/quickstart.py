@@ -1,7 +1,7 @@
 """Train CTCO on a MuJoCo task at a high interaction frequency, and look at what it does.
 
 By default: the sparse point mass at 500 Hz. A mass must be pushed to a small target; the reward is 1 a second on the
-target and nothing anywhere else. About two and a half minutes.
+target and nothing anywhere else. README.md says how long it takes.
 
     python examples/quickstart.py
     python examples/quickstart.py --task ball_in_cup --dt 0.02 --seconds 2400 --seed 1 --output runs/cup

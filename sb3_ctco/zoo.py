@@ -26,8 +26,9 @@ try:
     from rl_zoo3.hyperparams_opt import HYPERPARAMS_CONVERTER, HYPERPARAMS_SAMPLER
     from rl_zoo3.utils import ALGOS, get_wrapper_class
 except ImportError as error:  # pragma: no cover
+    missing = (error.name or "rl_zoo3").partition(".")[0]
     raise ImportError(
-        f"RL Zoo is needed, and {(error.name or 'rl_zoo3').partition('.')[0]} is missing: in a clone of sb3-ctco, run pip install '.[zoo]'"
+        f"RL Zoo is needed, and {missing} is missing: in a clone of sb3-ctco, run pip install '.[zoo]'"
     ) from error
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.vec_env import VecEnv

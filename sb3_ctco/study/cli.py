@@ -24,8 +24,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
     try:
         return args.call(args)
     except ModuleNotFoundError as error:
+        missing = (error.name or str(error)).partition(".")[0]
         print(
-            f"sb3-ctco study {args.command}: {(error.name or str(error)).partition('.')[0]} is missing: in a clone of sb3-ctco, run pip install '.[study]'",
+            f"sb3-ctco study {args.command}: {missing} is missing: in a clone of sb3-ctco, run pip install '.[study]'",
             file=sys.stderr,
         )
         return FAILED
