@@ -4,7 +4,7 @@ import json
 import math
 import pickle
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Protocol
 
@@ -12,7 +12,7 @@ import numpy as np
 import numpy.typing as npt
 from gymnasium import spaces
 
-from sb3_ctco.options import ActionBox, OptionSettings, action_plan, basis
+from sb3_ctco.options import ActionBox, OptionSpace
 
 if TYPE_CHECKING:
     from stable_baselines3.common.vec_env import VecNormalize
@@ -28,7 +28,7 @@ METADATA_KEY = "sb3_ctco"
 class OptionPolicy(Protocol):
     """What :class:`OptionController` needs of a policy: a function from observations to options, and their meaning."""
 
-    option_settings: OptionSettings
+    option_space: OptionSpace
     primitive_action_space: spaces.Box
 
     def __call__(self, observation: Observation) -> np.ndarray:
@@ -62,7 +62,7 @@ class ModelPolicy:
                 f"this {type(model).__name__} never had an environment, so the bounds of its actions are not known: "
                 "call set_env(env) before, and save the model after that"
             )
-        self.option_settings = model.option_settings
+        self.option_space = model.option_space
         self.primitive_action_space = model.primitive_action_space
         self.deterministic = deterministic
         self.vec_normalize = model.get_vec_normalize_env() if vec_normalize is None else vec_normalize
@@ -100,7 +100,7 @@ class OnnxPolicy:
         metadata = self._session.get_modelmeta().custom_metadata_map
         if METADATA_KEY not in metadata:
             raise ValueError(f"{path} does not tell what its options mean: write it with sb3_ctco.export.export_onnx")
-        self.option_settings, self.primitive_action_space, self._observations = _from_metadata(metadata[METADATA_KEY])
+        self.option_space, self.primitive_action_space, self._observations = _from_metadata(metadata[METADATA_KEY])
 
     def __call__(self, observation: Observation) -> np.ndarray:
         """Options for one or several observations.
@@ -119,16 +119,14 @@ class OnnxPolicy:
         return options if several else options[0]
 
 
-def to_metadata(
-    settings: OptionSettings, action_space: spaces.Box, observations: dict[str, tuple[tuple[int, ...], str]]
-) -> str:
+def to_metadata(settings: OptionSpace, action_space: spaces.Box, observations: dict[str, tuple[tuple[int, ...], str]]) -> str:
     """What an exported policy's options mean, as a line of JSON.
 
     :param observations: shape and dtype of each observation, by the name of the file's input
     """
     return json.dumps(
         {
-            "option_settings": asdict(settings),
+            "option_space": settings.arguments,
             "action_low": action_space.low.tolist(),
             "action_high": action_space.high.tolist(),
             "action_dtype": str(action_space.dtype),
@@ -137,12 +135,12 @@ def to_metadata(
     )
 
 
-def _from_metadata(text: str) -> tuple[OptionSettings, spaces.Box, dict[str, tuple[tuple[int, ...], str]]]:
+def _from_metadata(text: str) -> tuple[OptionSpace, spaces.Box, dict[str, tuple[tuple[int, ...], str]]]:
     data = json.loads(text)
     dtype = np.dtype(data["action_dtype"])
     box = spaces.Box(np.array(data["action_low"], dtype), np.array(data["action_high"], dtype), dtype=dtype.type)
     observations = {name: (tuple(shape), kind) for name, (shape, kind) in data["observations"].items()}
-    return OptionSettings(**data["option_settings"]), box, observations
+    return OptionSpace.make(**data["option_space"]), box, observations
 
 
 @dataclass(slots=True)
@@ -205,7 +203,7 @@ class OptionController:
         vec_normalize: "VecNormalize | str | Path | None" = None,
     ):
         self.policy = _as_policy(policy, deterministic, vec_normalize)
-        trained = self.policy.option_settings
+        trained = self.policy.option_space
         #: What options mean here: training's settings, at this controller's ``dt``.
         self.settings = trained if dt is None else replace(trained, dt=dt)
         self._box = ActionBox(self.policy.primitive_action_space.low, self.policy.primitive_action_space.high)
@@ -273,7 +271,7 @@ class OptionController:
         self._now = now
         # A late tick may find the phase past its end, where the option holds its last action.
         phases = np.array([min((now - e.start) / (e.n_steps * dt), 1.0) for e in self._executions])
-        features = basis(phases, self.settings.n_rbf)
+        features = self.settings.trajectory.basis(phases)
         actions = self._box.cast(np.array([row.dot(e.weights) for row, e in zip(features, self._executions, strict=True)]))
         return actions if self._several else actions[0]
 
@@ -295,7 +293,7 @@ class OptionController:
         # As OptionExecutionWrapper does, in the same precision.
         option = np.clip(option.astype(np.float64), -1.0, 1.0)
         omega, n_steps = self.settings.decode(option)
-        plan = self._box.actions(action_plan(omega, n_steps))
+        plan = self._box.actions(self.settings.trajectory.plan(omega, n_steps))
         # Features sum to one, so that actions are the same combination of weights in their own units.
         return _Execution(option, n_steps, plan, self._box.scale(omega.T), start=now)
 

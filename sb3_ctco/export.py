@@ -114,7 +114,7 @@ def export_onnx(
 
     file = onnx.load(path)
     entry = file.metadata_props.add()
-    entry.key, entry.value = METADATA_KEY, to_metadata(policy.option_settings, policy.primitive_action_space, observations)
+    entry.key, entry.value = METADATA_KEY, to_metadata(policy.option_space, policy.primitive_action_space, observations)
     onnx.save(file, path)
 
 

@@ -19,7 +19,7 @@ from sb3_ctco.common import soft_actor_critic
 from sb3_ctco.export import export_onnx
 from sb3_ctco.figar_sac.figar_sac import actor_loss, repetition_values
 from sb3_ctco.figar_sac.policies import FiGARSACPolicy, decode_repetitions, encode_repetitions
-from sb3_ctco.options import OptionSettings, discount
+from sb3_ctco.options import OptionSpace, discount
 
 SMALL = {"policy_kwargs": {"net_arch": [8]}, "batch_size": 8, "device": "cpu", "seed": 0, "learning_starts": 20}
 
@@ -112,7 +112,7 @@ def test_the_critic_learns_the_repetition_that_ran(random_walk_env):
 @pytest.mark.parametrize("n", [*range(1, 25), 79, 100, 127, 300, 517])
 def test_repetitions_are_exact(dt, n):
     """Each k of {1, …, K} becomes k steps, whether numpy or torch encodes it, in single precision."""
-    option = OptionSettings(n_rbf=1, d_max=n * dt, d_min=dt, dt=dt, discount_rate=0.0)
+    option = OptionSpace.make(n_rbf=1, d_max=n * dt, d_min=dt, dt=dt, discount_rate=0.0)
     repetitions = np.arange(1, n + 1, dtype=np.float32)
     for encoded in (encode_repetitions(repetitions, n), encode_repetitions(th.tensor(repetitions), n).numpy()):
         assert encoded.dtype == np.float32
@@ -125,7 +125,7 @@ def test_repetitions_are_exact(dt, n):
 @given(n=st.integers(1, 5000), dt=st.floats(1e-4, 10.0), share=st.floats(0.0, 1.0))
 def test_any_repetition_is_exact(n, dt, share):
     k = 1 + round(share * (n - 1))
-    option = OptionSettings(n_rbf=1, d_max=n * dt, d_min=dt, dt=dt, discount_rate=0.0)
+    option = OptionSpace.make(n_rbf=1, d_max=n * dt, d_min=dt, dt=dt, discount_rate=0.0)
     encoded = encode_repetitions(np.array([k], dtype=np.float32), n)
     assert option.decode(np.array([0.0, encoded[0]], dtype=np.float32))[1] == k
 
@@ -291,8 +291,8 @@ def test_temperature_of_the_repetition_follows_its_entropy(random_walk_env):
 
 def test_a_bare_environment_is_wrapped(random_walk_env):
     model = make(random_walk_env(), n_repetitions=7)
-    one = model.get_env().get_attr("option_settings")[0]
-    assert (one.n_rbf, one.d_min, one.dt) == (1, 0.1, 0.1)
+    one = model.get_env().get_attr("option_space")[0]
+    assert (one.trajectory.n_weights, one.d_min, one.dt) == (1, 0.1, 0.1)
     assert one.d_max == pytest.approx(0.7)
     assert make(random_walk_env()).n_repetitions == 20
     assert model.critic(th.zeros(2, 2), th.zeros(2, 1)).shape == (2, 2, 7)

@@ -96,7 +96,7 @@ def test_bad_wrapper_settings(scripted_env):
 def test_the_wrapper_can_be_rebuilt_from_its_spec():
     env = RewardRateWrapper(gym.make("Pendulum-v1"), discount_rate=0.1)
     again = gym.make(env.spec)
-    assert again.option_settings == env.option_settings
+    assert again.option_space == env.option_space
 
 
 # --- the schedule of updates
@@ -138,7 +138,7 @@ def test_the_same_clock_at_every_dt(scripted_env, dt, gamma):
     assert type(model) is SAC
     assert model.gamma == pytest.approx(gamma)
     assert model.learning_starts == round(3.0 / dt)
-    one = model.get_env().get_attr("option_settings")[0]
+    one = model.get_env().get_attr("option_space")[0]
     assert (one.dt, one.discount_rate) == (dt, pytest.approx(DEFAULT_DISCOUNT_RATE))
     assert model.gradient_steps / model.train_freq.frequency == pytest.approx(20 * dt, rel=1e-3)
 

@@ -127,7 +127,7 @@ def test_seconds_become_steps(algorithm, rate):
     if algorithm in ("sac", "dac_ppo"):
         gamma = model.gamma if algorithm == "sac" else model.step_gamma
         assert gamma == pytest.approx(0.98 ** (1 / rate / 0.05))
-        assert model.get_env().get_attr("option_settings")[0].dt == pytest.approx(1 / rate)
+        assert model.get_env().get_attr("option_space")[0].dt == pytest.approx(1 / rate)
     if algorithm == "sac":
         assert model.gradient_steps / model.train_freq.frequency * rate == pytest.approx(20)
     else:

@@ -89,7 +89,7 @@ def test_the_wrapper_has_the_settings_of_the_entry_and_the_command_line(tmp_path
     (model,) = models
     assert model.n_rbf == 4
     assert model.d_max == entries("ctco")["Pendulum-v1"]["d_max"]
-    assert model.option_settings.discount_rate == pytest.approx(-np.log(0.9) / 0.1)
+    assert model.option_space.discount_rate == pytest.approx(-np.log(0.9) / 0.1)
     assert model.get_env().get_attr("n_sub_options") == [2]
     saved = yaml.unsafe_load((tmp_path / "ctco/Pendulum-v1_1/Pendulum-v1/config.yml").read_text())
     wrapper = saved["env_wrapper"][0]["sb3_ctco.wrappers.OptionExecutionWrapper"]

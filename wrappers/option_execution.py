@@ -23,11 +23,11 @@ from sb3_ctco.options import (
     DEFAULT_DISCOUNT_RATE,
     REWARD_UNITS,
     ActionBox,
-    OptionSettings,
+    DurationScale,
+    OptionSpace,
     RewardUnit,
-    action_plan,
+    Trajectory,
     discounts_of_steps,
-    fit_slices,
     integrated_reward,
     step_weight,
 )
@@ -37,6 +37,9 @@ SequenceResult = tuple[Any, npt.ArrayLike, bool, bool, dict[str, Any]]
 StepSequence = Callable[..., SequenceResult]
 Stacked = np.ndarray | dict[str, np.ndarray]
 
+
+#: Where the loop over ``step`` leaves what it observed on the way, so that an environment's own infos stay
+_ON_THE_WAY = "_observations_on_the_way"
 
 #: Gymnasium's TimeLimit, and that which RL Zoo puts in its place
 _TIME_LIMITS = ("gymnasium.wrappers.common.TimeLimit", "rl_zoo3.gym_patches.PatchedTimeLimit")
@@ -77,7 +80,7 @@ def find_dt(env: gym.Env) -> float | None:
     return None if dt is None else float(dt)
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class SubOptions:
     """Shorter options that an option contained, as transitions: ``info["sub_options"]``.
 
@@ -117,6 +120,19 @@ class SubOptions:
     def __len__(self) -> int:
         return len(self.options)
 
+    def __eq__(self, other: object) -> bool:
+        if not isinstance(other, SubOptions):
+            return NotImplemented
+        fields = [(mine, vars(other)[name]) for name, mine in vars(self).items()]
+        return all(
+            mine.keys() == its.keys() and all(np.array_equal(mine[key], its[key]) for key in mine)
+            if isinstance(mine, dict) and isinstance(its, dict)
+            else np.array_equal(mine, its)
+            for mine, its in fields
+        )
+
+    __hash__ = None  # type: ignore[assignment]
+
     def __deepcopy__(self, memo: dict[int, Any]) -> "SubOptions":
         # Stable-Baselines3 copies infos deeply; what nobody writes to need not be copied.
         return self
@@ -126,6 +142,55 @@ def _stack(observations: list[Any]) -> Stacked:
     if isinstance(observations[0], dict):
         return {key: np.array([obs[key] for obs in observations]) for key in observations[0]}
     return np.array(observations)
+
+
+def reset_env(env: gym.Env, seed: int | None, options: dict[str, Any] | None) -> tuple[Any, dict[str, Any]]:
+    """Reset an environment, and look at what it returns.
+
+    :raises TypeError: if that is not an observation and an info
+    :raises ValueError: if the observation is not finite, or not as its space says
+    """
+    # Many environments' reset takes a seed and nothing else; Stable-Baselines3 passes options only if there are some, too.
+    result = env.reset(seed=seed) if options is None else env.reset(seed=seed, options=options)
+    if not (isinstance(result, tuple) and len(result) == 2 and isinstance(result[1], dict)):
+        raise TypeError(
+            f"reset of the environment {env} must return an observation and an info, a dictionary, as Gymnasium's do, not "
+            f"{result!r}: wrap one of the old Gym in shimmy.GymV21CompatibilityV0"
+        )
+    check_observation(env, result[0])
+    return result
+
+
+def check_observation(env: gym.Env, obs: Any) -> None:
+    """Look at what an environment observed.
+
+    :raises ValueError: if it is not finite, or not as the environment's space says
+    """
+    fault = _find_fault(obs, env.observation_space)
+    if fault is not None:
+        raise ValueError(f"the environment {env} returned an observation that {fault}")
+
+
+def _find_fault(obs: Any, space: spaces.Space) -> str | None:
+    """What is wrong with an observation: a key, a shape, or a number that is not finite; None if nothing is."""
+    if isinstance(space, spaces.Dict):
+        if not isinstance(obs, dict) or obs.keys() != space.spaces.keys():
+            return f"is no dictionary of {sorted(space.spaces)}: {obs}"
+        faults = ((key, _find_fault(obs[key], inner)) for key, inner in space.spaces.items())
+        return next((f"has a {key!r} that {fault}" for key, fault in faults if fault), None)
+    if isinstance(space, spaces.Box):
+        if np.shape(obs) != space.shape:
+            return f"has the shape {np.shape(obs)}, not its space's {space.shape}: {obs}"
+        if not _is_finite(obs):
+            return f"is not finite: {obs}"
+    return None
+
+
+def _is_finite(obs: Any) -> bool:
+    if isinstance(obs, dict):
+        return all(_is_finite(value) for value in obs.values())
+    array = np.asarray(obs)
+    return array.dtype.kind != "f" or bool(np.isfinite(array).all())
 
 
 def _at(stacked: Stacked, rows: Any) -> Any:
@@ -171,6 +236,8 @@ class OptionExecutionWrapper(gym.Wrapper, RecordConstructorArgs):
         ``info["sub_options"]`` (:class:`SubOptions`), for a replay buffer that learns from them
     :param sub_option_tolerance: leave out a sub-option if its actions deviate by more from those that were played;
         actions count as normalised to [−1, 1]
+    :param trajectory: how ω becomes actions, a name in ``sb3_ctco.options.TRAJECTORIES`` or a class
+    :param duration_scale: ``"log"`` or ``"linear"``, see :class:`~sb3_ctco.options.OptionSpace`
     :raises TypeError: if the action space is not a ``Box``
     :raises ValueError: if its bounds are not finite, a setting is out of range, or dt is not given and not found
     """
@@ -189,6 +256,8 @@ class OptionExecutionWrapper(gym.Wrapper, RecordConstructorArgs):
         reward_unit: RewardUnit = "rate",
         n_sub_options: int = 0,
         sub_option_tolerance: float = 0.1,
+        trajectory: str | type[Trajectory] = "rbf",
+        duration_scale: DurationScale = "linear",
     ):
         RecordConstructorArgs.__init__(
             self,
@@ -201,6 +270,8 @@ class OptionExecutionWrapper(gym.Wrapper, RecordConstructorArgs):
             reward_unit=reward_unit,
             n_sub_options=n_sub_options,
             sub_option_tolerance=sub_option_tolerance,
+            trajectory=trajectory,
+            duration_scale=duration_scale,
         )
         gym.Wrapper.__init__(self, env)
 
@@ -229,8 +300,8 @@ class OptionExecutionWrapper(gym.Wrapper, RecordConstructorArgs):
                 "OptionExecutionWrapper(env, dt=0.02)"
             )
         #: The settings that a policy for this environment must share.
-        self.option_settings = OptionSettings(
-            n_rbf=n_rbf, d_max=d_max, d_min=dt if d_min is None else d_min, dt=dt, discount_rate=discount_rate
+        self.option_space = OptionSpace.make(
+            n_rbf, d_max, dt if d_min is None else d_min, dt, discount_rate, trajectory, duration_scale
         )
         self.reward: Literal["sum", "integral"] = reward
         self.reward_unit: RewardUnit = reward_unit
@@ -240,22 +311,24 @@ class OptionExecutionWrapper(gym.Wrapper, RecordConstructorArgs):
         self._box = ActionBox(space.low, space.high)
         option_dim = space.low.size * n_rbf + 1
         self.action_space = spaces.Box(-1.0, 1.0, (option_dim,), np.float32)
-        self._checks_observation = isinstance(env.observation_space, spaces.Box) and np.issubdtype(
-            env.observation_space.dtype, np.floating
-        )
         self._play: StepSequence | None = None
 
         self.n_sub_options = 0
         self.set_n_sub_options(n_sub_options)
         self.sub_option_tolerance = sub_option_tolerance
-        self._shortest = math.ceil(self.option_settings.d_min / dt - 1e-6)
+        self._shortest = math.ceil(self.option_space.d_min / dt - 1e-6)
         # A generator of its own, so that sub-options change nothing in what the environment does.
         self._slice_rng = np.random.default_rng()
         self._last_obs: Any = None
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
-        """Reset the inner environment."""
-        result = self.env.reset(seed=seed, options=options)
+        """Reset the inner environment.
+
+        :raises TypeError: if the environment does not return an observation and an info
+        :raises ValueError: if the observation is not finite, or not as its space says
+        """
+        self._play = None
+        result = reset_env(self.env, seed, options)
         if seed is not None:
             self._slice_rng = np.random.default_rng(seed)
         self._last_obs = deepcopy(result[0]) if self.n_sub_options else None
@@ -268,8 +341,9 @@ class OptionExecutionWrapper(gym.Wrapper, RecordConstructorArgs):
         :param action: the option, shape ``[action_dim · n_rbf + 1]``
         :raises gymnasium.error.ResetNeeded: before the first reset, after the end of an episode, and after an error
             in the middle of an option
+        :raises TypeError: if the environment does not return what Gymnasium's step returns
         :raises ValueError: if the option has another shape or is not finite, or if the environment returned a reward
-            or an observation that is not finite
+            or an observation that is not finite or has another shape
         """
         given = np.asarray(plain(action), dtype=np.float64)
         option = given.ravel()
@@ -281,29 +355,22 @@ class OptionExecutionWrapper(gym.Wrapper, RecordConstructorArgs):
             raise ResetNeeded("call reset() first: the environment was not reset, its episode ended, or it raised an error")
         play, self._play = self._play, None
 
-        settings = self.option_settings
+        settings = self.option_space
         omega, n_steps = settings.decode(option.clip(-1.0, 1.0))
-        trajectory = action_plan(omega, n_steps)
+        trajectory = settings.trajectory.plan(omega, n_steps)
         slices = self._draw_slices(n_steps)
         observe = sorted({k for ends in slices for k in ends} - {0, n_steps})
         actions = self._box.actions(trajectory)
-        obs, rewards, terminated, truncated, info = play(actions, observe) if observe else play(actions)
-        observations = info.pop("observations", []) if observe else []
-
-        rewards = np.asarray(rewards, dtype=np.float64)
-        total = float(rewards.sum())
-        if not math.isfinite(total):
-            raise ValueError(f"the environment {self.env} returned a reward that is not finite: {rewards}")
+        obs, rewards, terminated, truncated, info = self._checked(play, actions, observe)
+        observations = info.pop(_ON_THE_WAY if _ON_THE_WAY in info else "observations", []) if observe else []
         # Stacked, they are copies, too: the environment may overwrite its own.
         seen = _stack([self._last_obs, *observations, obs]) if self.n_sub_options else None
-        if self._checks_observation and not np.isfinite(obs if seen is None else seen).all():  # type: ignore[arg-type]
-            raise ValueError(
-                f"the environment {self.env} returned an observation that is not finite: {obs if seen is None else seen}"
-            )
+        if len(observations) and not _is_finite(seen):
+            raise ValueError(f"the environment {self.env} returned an observation that is not finite: {seen}")
         if not (terminated or truncated):
             self._play = play
 
-        n_ran = len(rewards)
+        n_ran, total = len(rewards), float(rewards.sum())
         duration = n_ran * settings.dt
         integral = integrated_reward(rewards, settings.dt, settings.discount_rate, self.reward_unit)
         info["option"] = {
@@ -335,8 +402,34 @@ class OptionExecutionWrapper(gym.Wrapper, RecordConstructorArgs):
         :param option: shape ``[action_dim · n_rbf + 1]``
         :return: shape ``[n_steps, *action_shape]``
         """
-        omega, n_steps = self.option_settings.decode(np.clip(plain(option), -1.0, 1.0))
-        return self._box.actions(action_plan(omega, n_steps))
+        return self._box.actions(self.option_space.plan(np.clip(plain(option), -1.0, 1.0)))
+
+    def _checked(
+        self, play: StepSequence, actions: np.ndarray, observe: Sequence[int]
+    ) -> tuple[Any, np.ndarray, bool, bool, dict[str, Any]]:
+        """Play actions, and look at what the environment returns; rewards as an array ``[n_steps]``."""
+        try:
+            obs, rewards, terminated, truncated, info = play(actions, observe) if observe else play(actions)
+        except (TypeError, ValueError) as error:
+            if "unpack" not in str(error):
+                raise
+            raise TypeError(
+                f"{error}, from the environment {self.env}: step must return observation, reward, terminated, truncated and "
+                "info, as Gymnasium's do; wrap one of the old Gym in shimmy.GymV21CompatibilityV0"
+            ) from error
+        if not isinstance(info, dict):
+            raise TypeError(f"the environment {self.env} returned the info {info!r}, which must be a dictionary")
+        # None and strings would pass for False and True.
+        for name, value in (("terminated", terminated), ("truncated", truncated)):
+            if not isinstance(value, int | np.bool_):
+                raise TypeError(f"the environment {self.env} returned {name}={value!r}, which must be True or False")
+        rewards = np.asarray(rewards, dtype=np.float64)
+        if rewards.size != len(rewards):
+            raise ValueError(f"the environment {self.env} returned rewards that are no numbers: {rewards}")
+        if not np.isfinite(rewards).all():
+            raise ValueError(f"the environment {self.env} returned a reward that is not finite: {rewards}")
+        check_observation(self.env, obs)
+        return obs, rewards.reshape(-1), terminated, truncated, info
 
     def _draw_slices(self, n_steps: int) -> list[tuple[int, int]]:
         """Random stretches ``(first step, step after the last)`` of an option, of at least ``d_min``, not all of it."""
@@ -360,13 +453,13 @@ class OptionExecutionWrapper(gym.Wrapper, RecordConstructorArgs):
 
         :param steps: after how many steps of the option each row of ``seen`` was observed
         """
-        settings, n_ran = self.option_settings, len(rewards)
+        settings, n_ran = self.option_space, len(rewards)
         firsts, ends = np.array(slices, dtype=np.int64).reshape(-1, 2).T
         if n_ran < len(trajectory):
             ends = np.minimum(ends, n_ran)
             long_enough = ends - firsts >= self._shortest
             firsts, ends = firsts[long_enough], ends[long_enough]
-        omega, residuals = fit_slices(trajectory, firsts, ends, settings.n_rbf)
+        omega, residuals = settings.trajectory.fit(trajectory, firsts, ends)
         kept = residuals <= self.sub_option_tolerance
         if not kept.all():
             firsts, ends, omega, residuals = firsts[kept], ends[kept], omega[kept], residuals[kept]
@@ -404,7 +497,7 @@ class OptionExecutionWrapper(gym.Wrapper, RecordConstructorArgs):
             if last < len(actions):
                 observations.append(deepcopy(obs))
         if observe:
-            info["observations"] = observations
+            info[_ON_THE_WAY] = observations
         return obs, rewards, terminated, truncated, info
 
 

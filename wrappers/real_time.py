@@ -9,7 +9,7 @@ from typing import Any, Protocol, SupportsFloat, runtime_checkable
 import gymnasium as gym
 from gymnasium.utils import RecordConstructorArgs
 
-from sb3_ctco.wrappers.option_execution import find_dt
+from sb3_ctco.wrappers.option_execution import find_dt, reset_env
 
 logger = logging.getLogger(__name__)
 
@@ -120,7 +120,7 @@ class RealTimeWrapper(gym.Wrapper, RecordConstructorArgs):
         self._log()
         self.statistics = TickStatistics()
         self._due = None
-        return self.env.reset(seed=seed, options=options)
+        return reset_env(self.env, seed, options)
 
     def step(self, action: Any) -> tuple[Any, SupportsFloat, bool, bool, dict[str, Any]]:
         """Send a command and return what is observed one period later."""

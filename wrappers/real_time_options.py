@@ -50,12 +50,12 @@ class RealTimeOptionWrapper(OptionExecutionWrapper):
             self, decide_ahead=decide_ahead, interrupt=interrupt, background=background, _disable_deepcopy=True, **kwargs
         )
         super().__init__(env, **kwargs)
-        if not 0.0 <= decide_ahead < self.option_settings.d_max:
+        if not 0.0 <= decide_ahead < self.option_space.d_max:
             raise ValueError(
-                f"decide_ahead must be at least 0 s and less than d_max={self.option_settings.d_max} s, not {decide_ahead}"
+                f"decide_ahead must be at least 0 s and less than d_max={self.option_space.d_max} s, not {decide_ahead}"
             )
         self.interrupt = interrupt
-        self._ahead_steps = round(decide_ahead / self.option_settings.dt)
+        self._ahead_steps = round(decide_ahead / self.option_space.dt)
         self._executor = ThreadPoolExecutor(1, thread_name_prefix="option") if background else None
         self._rest: np.ndarray | None = None
         self._playing_rest: Future[SequenceResult] | None = None
@@ -80,17 +80,12 @@ class RealTimeOptionWrapper(OptionExecutionWrapper):
         cls, wrapper: OptionExecutionWrapper, decide_ahead: float, interrupt: Interrupt | None, background: bool
     ) -> "RealTimeOptionWrapper":
         """The same wrapper around the same environment, with what this class adds, and without sub-options."""
-        settings = wrapper.option_settings
         return cls(
             wrapper.env,
             decide_ahead,
             interrupt,
             background,
-            n_rbf=settings.n_rbf,
-            d_max=settings.d_max,
-            d_min=settings.d_min,
-            dt=settings.dt,
-            discount_rate=settings.discount_rate,
+            **wrapper.option_space.arguments,
             reward=wrapper.reward,
             reward_unit=wrapper.reward_unit,
         )
@@ -156,7 +151,7 @@ class RealTimeOptionWrapper(OptionExecutionWrapper):
             if terminated or truncated:
                 break
             if self.interrupt is not None and self.interrupt(
-                self._decided_on, obs, (steps_before + len(rewards)) * self.option_settings.dt
+                self._decided_on, obs, (steps_before + len(rewards)) * self.option_space.dt
             ):
                 info = {**info, "interrupted": True}
                 break

@@ -6,8 +6,8 @@ import gymnasium as gym
 import numpy as np
 from gymnasium.utils import RecordConstructorArgs
 
-from sb3_ctco.options import DEFAULT_DISCOUNT_RATE, OptionSettings, discount, step_weight
-from sb3_ctco.wrappers.option_execution import find_dt
+from sb3_ctco.options import DEFAULT_DISCOUNT_RATE, OptionSpace, discount, step_weight
+from sb3_ctco.wrappers.option_execution import check_observation, find_dt, reset_env
 
 
 class RewardRateWrapper(gym.Wrapper, RecordConstructorArgs):
@@ -51,22 +51,30 @@ class RewardRateWrapper(gym.Wrapper, RecordConstructorArgs):
                 "metadata['render_fps']): pass dt, in seconds, to RewardRateWrapper"
             )
         #: The clock: a step as an option of one step
-        self.option_settings = OptionSettings(n_rbf=1, d_max=dt, d_min=dt, dt=dt, discount_rate=discount_rate)
+        self.option_space = OptionSpace.make(1, d_max=dt, d_min=dt, dt=dt, discount_rate=discount_rate)
         self.reward_scale = reward_scale
         self._weight = step_weight(dt, discount_rate)
         self._discount = float(discount(dt, discount_rate))
 
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
+        """Reset the inner environment.
+
+        :raises ValueError: if the observation is not finite, or not as its space says
+        """
+        return reset_env(self.env, seed, options)
+
     def step(self, action: Any) -> tuple[Any, SupportsFloat, bool, bool, dict[str, Any]]:
         """Step the inner environment, and weigh its reward.
 
-        :raises ValueError: if the reward is not finite
+        :raises ValueError: if the reward or the observation is not finite
         """
         obs, reward, terminated, truncated, info = self.env.step(action)
         integral = float(reward) * self._weight
         if not np.isfinite(integral):
             raise ValueError(f"the environment {self.env} returned a reward that is not finite: {reward}")
+        check_observation(self.env, obs)
         info["option"] = {
-            "duration": self.option_settings.dt,
+            "duration": self.option_space.dt,
             "n_steps": 1,
             "integrated_reward": integral,
             "discount": self._discount,

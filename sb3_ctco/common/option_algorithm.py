@@ -1,12 +1,12 @@
 """The base of off-policy algorithms that decide by options: environments, replay buffer, time accounting."""
 
-import dataclasses
 import io
 import json
+import math
 import pathlib
 import warnings
 import zipfile
-from typing import Any, ClassVar, TypeVar
+from typing import Any, ClassVar, Literal, TypeVar
 
 import gymnasium as gym
 import numpy as np
@@ -42,10 +42,11 @@ from stable_baselines3.common.vec_env import (
 
 from sb3_ctco.common.buffers import DictOptionReplayBuffer, OptionReplayBuffer
 from sb3_ctco.common.callbacks import OptionProgressBarCallback, PrimitiveStepCallback, eval_callbacks
+from sb3_ctco.common.load_arguments import check_load_arguments
 from sb3_ctco.common.vec_env import PLAYED, AsyncOptionVecEnv
 from sb3_ctco.option_array import OptionArray
-from sb3_ctco.options import OptionSettings, discount_rate_from_gamma
-from sb3_ctco.wrappers import OptionExecutionWrapper, SubOptions, find_dt
+from sb3_ctco.options import DurationScale, OptionSpace, Trajectory, discount_rate_from_gamma, step_weight
+from sb3_ctco.wrappers import OptionExecutionWrapper, find_dt
 
 SelfOptionOffPolicyAlgorithm = TypeVar("SelfOptionOffPolicyAlgorithm", bound="OptionOffPolicyAlgorithm")
 
@@ -64,6 +65,10 @@ class OptionOffPolicyAlgorithm(OffPolicyAlgorithm):
     :param d_max: longest duration of an option, in s
     :param d_min: shortest duration, in s; by default one step of the environment
     :param dt: the environment's interaction period, in s; by default found in the environment
+    :param trajectory: how ω becomes actions, a name in ``sb3_ctco.options.TRAJECTORIES`` or a class
+    :param duration_scale: ``"log"`` or ``"linear"``, see :class:`~sb3_ctco.options.OptionSpace`
+    :param reward_scale: what R is multiplied by for the critics, or ``"gamma_dt"`` for the unit of a reward of 1 over
+        ``gamma_dt``
     :param gamma: discount factor over ``gamma_dt`` seconds, in (0, 1]
     :param gamma_dt: in s
     :param train_freq: collect at least this many primitive steps (in each environment) between trainings
@@ -75,6 +80,19 @@ class OptionOffPolicyAlgorithm(OffPolicyAlgorithm):
     :raises ValueError: for settings out of range or contradicting each other or the environment's
     """
 
+    #: Arguments that ``load`` cannot change: what options mean, and what was learned or decides what is saved
+    _kept_when_loaded: ClassVar[tuple[str, ...]] = (
+        "n_rbf",
+        "d_max",
+        "d_min",
+        "trajectory",
+        "duration_scale",
+        "reward_scale",
+        "n_repetitions",
+        "ent_coef",
+        "duration_ent_coef",
+        "target_decision_rate",
+    )
     #: An attribute that this class's files have and others' have not
     _own_setting: ClassVar[str] = "discount_rate"
 
@@ -88,6 +106,9 @@ class OptionOffPolicyAlgorithm(OffPolicyAlgorithm):
         d_max: float,
         d_min: float | None,
         dt: float | None,
+        trajectory: str | type[Trajectory] = "rbf",
+        duration_scale: DurationScale = "linear",
+        reward_scale: float | Literal["gamma_dt"] = 1.0,
         gamma: float,
         gamma_dt: float,
         updates_per_second: float | None,
@@ -100,12 +121,17 @@ class OptionOffPolicyAlgorithm(OffPolicyAlgorithm):
         self.d_max = d_max
         self.d_min = d_min
         self.dt = dt
+        self.trajectory = trajectory
+        self.duration_scale: DurationScale = duration_scale
+        self.reward_scale: float | Literal["gamma_dt"] = reward_scale
         self.gamma = gamma
         self.gamma_dt = gamma_dt
         # An explicit dt stays the user's word on any environment; one that was found must be found again.
         self._dt_was_given = dt is not None
         #: τ, in 1/s
         self.discount_rate = discount_rate_from_gamma(gamma, gamma_dt)
+        if reward_scale != "gamma_dt" and not (isinstance(reward_scale, int | float) and 0 < reward_scale < math.inf):
+            raise ValueError(f"reward_scale must be a positive number or 'gamma_dt', not {reward_scale!r}")
         if updates_per_second is not None:
             if gradient_steps != -1:
                 raise ValueError(
@@ -138,7 +164,7 @@ class OptionOffPolicyAlgorithm(OffPolicyAlgorithm):
         )
 
     @property
-    def option_settings(self) -> OptionSettings:
+    def option_space(self) -> OptionSpace:
         """What the policy's option vectors mean.
 
         :raises ValueError: before ``dt`` and ``d_min`` are known, that is without an environment
@@ -148,9 +174,13 @@ class OptionOffPolicyAlgorithm(OffPolicyAlgorithm):
                 f"dt={self.dt} s and d_min={self.d_min} s are found in an environment, and {type(self).__name__} has not "
                 "had one: pass it env, or dt and d_min"
             )
-        return OptionSettings(
-            n_rbf=self.n_rbf, d_max=self.d_max, d_min=self.d_min, dt=self.dt, discount_rate=self.discount_rate
-        )
+        return OptionSpace.make(**{**self._option_arguments, "dt": self.dt, "d_min": self.d_min})
+
+    @property
+    def _option_arguments(self) -> dict[str, Any]:
+        """OptionExecutionWrapper's arguments for the same options, ``dt`` and ``d_min`` as far as they are known."""
+        names = ("n_rbf", "d_max", "d_min", "dt", "trajectory", "duration_scale", "discount_rate")
+        return {name: getattr(self, name) for name in names}
 
     @classmethod
     def wrapper_kwargs(cls, arguments: dict[str, Any]) -> dict[str, Any]:
@@ -158,8 +188,8 @@ class OptionOffPolicyAlgorithm(OffPolicyAlgorithm):
 
         :param arguments: the algorithm's arguments, defaults included
         """
-        kwargs = {name: arguments[name] for name in ("n_rbf", "d_max", "d_min", "dt")}
-        kwargs["n_sub_options"] = arguments.get("n_sub_options", 0)
+        names = ("n_rbf", "d_max", "d_min", "dt", "trajectory", "duration_scale", "n_sub_options")
+        kwargs = {name: arguments[name] for name in names if name in arguments}
         return {**kwargs, "discount_rate": discount_rate_from_gamma(arguments["gamma"], arguments["gamma_dt"])}
 
     def wrap_env(self, env: gym.Env, n_sub_options: int = 0) -> OptionExecutionWrapper:
@@ -172,15 +202,7 @@ class OptionOffPolicyAlgorithm(OffPolicyAlgorithm):
         dt = self.dt if self._dt_was_given else (find_dt(env) or self.dt)
         if unwrap_wrapper(env, Monitor) is None:
             env = Monitor(env)
-        return OptionExecutionWrapper(
-            env,
-            n_rbf=self.n_rbf,
-            d_max=self.d_max,
-            d_min=self.d_min,
-            dt=dt,
-            discount_rate=self.discount_rate,
-            n_sub_options=n_sub_options,
-        )
+        return OptionExecutionWrapper(env, **{**self._option_arguments, "dt": dt}, n_sub_options=n_sub_options)
 
     def _as_option_env(self, env: GymEnv) -> GymEnv:
         if isinstance(env, VecEnv):
@@ -217,7 +239,7 @@ class OptionOffPolicyAlgorithm(OffPolicyAlgorithm):
         self._check_settings(env)
         return env
 
-    def _check_env(self, env: VecEnv) -> OptionSettings:
+    def _check_env(self, env: VecEnv) -> OptionSpace:
         """The options' settings of an environment, once they agree with the algorithm's."""
         normalizer = unwrap_vec_normalize(env)
         if normalizer is not None and normalizer.norm_reward:
@@ -244,23 +266,17 @@ class OptionOffPolicyAlgorithm(OffPolicyAlgorithm):
         env.env_method("set_n_sub_options", self.n_sub_options)
         return settings
 
-    def _check_settings(self, env: VecEnv) -> OptionSettings:
+    def _check_settings(self, env: VecEnv) -> OptionSpace:
         """The options' settings of an environment, once options mean the same in it as to the algorithm."""
-        settings: list[OptionSettings] = env.get_attr("option_settings")
-        expected = {
-            "n_rbf": self.n_rbf,
-            "d_max": self.d_max,
-            "d_min": settings[0].d_min if self.d_min is None else self.d_min,
-            "dt": settings[0].dt if self.dt is None else self.dt,
-            "discount_rate": self.discount_rate,
-        }
+        settings: list[OptionSpace] = env.get_attr("option_space")
+        known = {name: value for name, value in self._option_arguments.items() if value is not None}
+        expected = OptionSpace.make(**{**settings[0].arguments, **known})
         for one in settings:
-            for name, value in expected.items():
-                if not np.isclose(getattr(one, name), value, rtol=1e-6, atol=0.0):
-                    raise ValueError(
-                        f"the environment's options have {name}={getattr(one, name)}, {type(self).__name__} has "
-                        f"{name}={value}: give both the same (discount_rate is -ln(gamma)/gamma_dt)"
-                    )
+            for name, (value, found) in expected.differences(one).items():
+                raise ValueError(
+                    f"the environment's options have {name}={found}, {type(self).__name__} has "
+                    f"{name}={value}: give both the same (discount_rate is -ln(gamma)/gamma_dt)"
+                )
         action_spaces: list[spaces.Box] = env.get_attr("primitive_action_space")
         for space in action_spaces:
             if space != (self.primitive_action_space or action_spaces[0]):
@@ -292,9 +308,20 @@ class OptionOffPolicyAlgorithm(OffPolicyAlgorithm):
     ) -> SelfOptionOffPolicyAlgorithm:
         """Stable-Baselines3's ``load``; a bare environment is wrapped with the settings in the file.
 
-        :raises ValueError: if the environment's settings differ from the file's, or if another algorithm wrote the file
+        :param kwargs: arguments of the constructor to change, such as ``learning_rate``, ``buffer_size`` or ``gamma``; not
+            those that options or networks depend on (such as ``n_rbf``, ``d_max``, ``d_min``, ``policy_kwargs``), and
+            not the temperatures, which are learned and saved
+        :raises TypeError: for an argument that the constructor does not have
+        :raises ValueError: if the environment's settings differ from the file's, for an argument that cannot be changed, or if
+            another algorithm wrote the file
         """
         cls._refuse_files_of_others(path)
+        kwargs = check_load_arguments(cls, path, kwargs, cls._kept_when_loaded)
+        # Of two that say the same in different ways, the one that is given holds.
+        if "gradient_steps" in kwargs:
+            kwargs.setdefault("updates_per_second", None)
+        elif kwargs.get("updates_per_second") is not None:
+            kwargs["gradient_steps"] = -1
         if env is not None:
             kwargs["n_envs"] = env.num_envs if isinstance(env, VecEnv) else 1
         model = super().load(path, None, device, custom_objects, print_system_info, force_reset, **kwargs)
@@ -332,7 +359,14 @@ class OptionOffPolicyAlgorithm(OffPolicyAlgorithm):
                 f"replay_buffer_class must be OptionReplayBuffer, DictOptionReplayBuffer or a subclass, not "
                 f"{self.replay_buffer_class.__name__}, which does not keep the durations of options"
             )
-        self.replay_buffer_kwargs = {**self.replay_buffer_kwargs, "discount_rate": self.discount_rate}
+        # Once more, since load may have changed gamma.
+        self.discount_rate = discount_rate_from_gamma(self.gamma, self.gamma_dt)
+        scale = 1.0 / step_weight(self.gamma_dt, self.discount_rate) if self.reward_scale == "gamma_dt" else self.reward_scale
+        self.replay_buffer_kwargs = {
+            **self.replay_buffer_kwargs,
+            "discount_rate": self.discount_rate,
+            "reward_scale": scale,
+        }
         if self.env is not None:
             settings = self._check_env(self.env)
             self.dt, self.d_min = settings.dt, settings.d_min
@@ -354,6 +388,22 @@ class OptionOffPolicyAlgorithm(OffPolicyAlgorithm):
             f"n_sub_options={self.n_sub_options} this buffer holds at least {decisions:,} decisions{span}",
             stacklevel=4,
         )
+
+    def load_replay_buffer(self, path: str | pathlib.Path | io.BufferedIOBase, truncate_last_traj: bool = True) -> None:
+        """Stable-Baselines3's; what is in the buffer is scaled as this algorithm scales rewards.
+
+        :raises ValueError: if its options were discounted at another rate
+        """
+        super().load_replay_buffer(path, truncate_last_traj)
+        buffer = self.replay_buffer
+        assert isinstance(buffer, OptionReplayBuffer | DictOptionReplayBuffer)
+        if not math.isclose(buffer.discount_rate, self.discount_rate, rel_tol=1e-6):
+            self.replay_buffer = None
+            raise ValueError(
+                f"the replay buffer in {path} has discount_rate={buffer.discount_rate}, {type(self).__name__} has "
+                f"discount_rate={self.discount_rate}: load it into a model with the same gamma and gamma_dt"
+            )
+        buffer.reward_scale = self.replay_buffer_kwargs["reward_scale"]
 
     def _init_callback(self, callback: MaybeCallback, progress_bar: bool = False) -> BaseCallback:
         if isinstance(callback, list):
@@ -416,22 +466,25 @@ class OptionOffPolicyAlgorithm(OffPolicyAlgorithm):
         dones: np.ndarray,
         infos: list[dict[str, Any]],
     ) -> None:
+        # A copy, since the caller's array may be the one that the environment is given.
+        buffer_action = buffer_action.copy()
         for i, info in enumerate(infos):
-            if "sub_options" in info:
-                self._residuals_since_log.extend(info["sub_options"].residuals)
-                info["sub_options"] = self._as_stored(info["sub_options"])
             if PLAYED in info:
                 buffer_action[i] = self.policy.scale_action(info[PLAYED])
+        self._see_what_ran(buffer_action, infos)
         super()._store_transition(replay_buffer, buffer_action, new_obs, reward, dones, infos)
-        self._durations_since_log.extend(info["option"]["duration"] for info in infos if "option" in info)
+        for info in infos:
+            if "option" in info:
+                self._durations_since_log.append(info["option"]["duration"])
+            if "sub_options" in info:
+                self._residuals_since_log.extend(info["sub_options"].residuals)
 
-    def _as_stored(self, sub_options: SubOptions) -> SubOptions:
-        """Sub-options come past the wrappers of the VecEnv, of which VecTransposeImage changes what is stored."""
-        assert self.env is not None
-        transpose = unwrap_vec_wrapper(self.env, VecTransposeImage)
-        if transpose is None:
-            return sub_options
-        return dataclasses.replace(sub_options, seen=transpose.transpose_observations(sub_options.seen))
+    def _see_what_ran(self, options: np.ndarray, infos: list[dict[str, Any]]) -> None:
+        """Adapt options to what ran of them, in place, before they are stored; a subclass may need to.
+
+        :param options: normalised, ``[n_envs, option_dim]``
+        :param infos: each with ``info["option"]``, unless its option runs on
+        """
 
     def dump_logs(self) -> None:
         """Write log data; also the durations of options, their mean and the decision rate since the last time."""

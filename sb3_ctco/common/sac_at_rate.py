@@ -11,7 +11,7 @@ from stable_baselines3.common.type_aliases import GymEnv
 from stable_baselines3.common.vec_env import VecEnv
 from stable_baselines3.sac.policies import SACPolicy
 
-from sb3_ctco.options import OptionSettings, discount, discount_rate_from_gamma, step_weight
+from sb3_ctco.options import OptionSpace, discount, discount_rate_from_gamma, step_weight
 from sb3_ctco.wrappers import RewardRateWrapper
 
 
@@ -100,9 +100,9 @@ def _with_reward_rate(env: GymEnv, dt: float, discount_rate: float, reward_scale
                 "sac_at_rate cannot wrap the environments of a VecEnv from outside: make it with "
                 "make_vec_env(..., wrapper_class=RewardRateWrapper, wrapper_kwargs=dict(dt=..., discount_rate=...))"
             )
-        settings: list[OptionSettings] = env.get_attr("option_settings")
+        settings: list[OptionSpace] = env.get_attr("option_space")
     elif (wrapped := unwrap_wrapper(env, RewardRateWrapper)) is not None:
-        settings = [wrapped.option_settings]  # type: ignore[attr-defined]
+        settings = [wrapped.option_space]  # type: ignore[attr-defined]
     else:
         if unwrap_wrapper(env, Monitor) is None:
             env = Monitor(env)

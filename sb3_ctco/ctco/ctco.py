@@ -17,13 +17,14 @@ from sb3_ctco.common.buffers import DictOptionReplayBuffer, OptionReplayBuffer
 from sb3_ctco.common.soft_actor_critic import SoftOptionActorCritic, critic_loss, critic_target
 from sb3_ctco.ctco.fast_update import FastUpdate
 from sb3_ctco.ctco.policies import CnnPolicy, CTCOPolicy, MlpPolicy, MultiInputPolicy, OptionActor, OptionCritic
+from sb3_ctco.options import DurationScale, Trajectory
 
 __all__ = ["CTCO", "actor_loss", "critic_loss", "critic_target", "log_reference_density"]
 
 SelfCTCO = TypeVar("SelfCTCO", bound="CTCO")
 
-EntropyReference = Literal["uniform", "paper", "duration"]
-ENTROPY_REFERENCES: tuple[EntropyReference, ...] = ("uniform", "paper", "duration")
+EntropyReference = Literal["uniform", "target", "paper"]
+ENTROPY_REFERENCES: tuple[EntropyReference, ...] = ("uniform", "target", "paper")
 
 
 def actor_loss(q_values: th.Tensor, entropy_costs: th.Tensor) -> th.Tensor:
@@ -35,33 +36,26 @@ def actor_loss(q_values: th.Tensor, entropy_costs: th.Tensor) -> th.Tensor:
     return (entropy_costs - q_values.amin(dim=0)).mean()
 
 
-def log_reference_density(omega_dim: int, d_min: float, d_max: float, reference: EntropyReference) -> th.Tensor:
+def log_reference_density(
+    omega_dim: int, d_min: float, d_max: float, reference: EntropyReference, target_entropies: th.Tensor
+) -> th.Tensor:
     """Log-density of what entropy is counted relative to, over the normalised option box.
 
     ``"uniform"`` is the uniform distribution over all options: log π − log u is never negative on average, so
-    a decision is never paid for its entropy. ``"paper"`` is the unit density over (ω, d in s): log π as it stands.
-    ``"duration"`` counts relative to the uniform distribution, too, and weights a decision's entropy by its option's
-    duration, see :func:`duration_weight`.
+    a decision is never paid for its entropy, and a policy of little entropy pays for each decision.
+    ``"target"`` is minus the target entropy: log π + H̄ is zero on average once learned temperatures have settled, so that β_h
+    is all that a decision costs.
+    ``"paper"`` is the unit density over (ω, d in s): log π as it stands.
 
+    :param target_entropies: of ω and of d, ``[2]``
     :return: for ω and d, shape ``[2]``
     """
-    if reference != "paper":
+    if reference == "uniform":
         return th.tensor([-omega_dim * math.log(2.0), -math.log(2.0)])
+    if reference == "target":
+        return -target_entropies
     # A duration in s has (d_max − d_min)/2 of the length of the box [−1, 1].
     return th.tensor([0.0, math.log((d_max - d_min) / 2.0) if d_max > d_min else 0.0])
-
-
-def duration_weight(durations: th.Tensor, d_min: float, d_max: float, discount_rate: float) -> th.Tensor:
-    """(1 − e^(−τd))/τ: what an entropy that is paid as a rate, for as long as an option runs, is worth at its start.
-
-    :param durations: normalised to [−1, 1], any shape
-    :param d_min: in s
-    :param d_max: in s
-    :param discount_rate: τ, in 1/s
-    :return: in s, the shape of ``durations``; the limit d for τ → 0
-    """
-    seconds = d_min + 0.5 * (durations + 1.0) * (d_max - d_min)
-    return -th.expm1(-discount_rate * seconds) / discount_rate if discount_rate > 0 else seconds
 
 
 class CTCO(SoftOptionActorCritic):
@@ -102,6 +96,11 @@ class CTCO(SoftOptionActorCritic):
     :param d_max: longest duration of an option, in s
     :param d_min: shortest duration, in s; by default one step of the environment
     :param dt: interaction period of the environment, in s; by default found in the environment
+    :param trajectory: how ω becomes actions: ``"rbf"``, the paper's radial basis functions, ``"bezier"``, or a subclass of
+        :class:`~sb3_ctco.options.Trajectory`
+    :param duration_scale: ``"linear"``, the paper's, or ``"log"``, see :class:`~sb3_ctco.options.OptionSpace`
+    :param reward_scale: what R is multiplied by for the critics, a number, or ``"gamma_dt"`` for a unit in which a reward of 1
+        over ``gamma_dt`` is worth 1, as a reward is to SAC at that rate. β_h and temperatures are in the unit of what results
     :param high_freq_penalty: β_h, subtracted once a decision in the critic's target, or a function of the remaining
         progress
     :param target_decision_rate: in Hz, in place of a fixed β_h: ``high_freq_penalty`` is where β_h starts, and it rises
@@ -114,7 +113,7 @@ class CTCO(SoftOptionActorCritic):
     :param target_entropy_anneal: the last fraction of training, in [0, 1], in which both target entropies fall, linearly, by
         one nat a dimension in all: explore first, then get precise; 0 keeps them
     :param duration_learning_rate: step size of d's head; ``learning_rate`` by default
-    :param entropy_reference: ``"uniform"``, ``"paper"`` or ``"duration"``, see :func:`log_reference_density`
+    :param entropy_reference: ``"uniform"``, ``"target"`` or ``"paper"``, see :func:`log_reference_density`
     :param fast_updates: whether to compute gradients without autograd where that is known to give the same, see
         :mod:`sb3_ctco.ctco.fast_update`; ``fast_updates_refusal`` says why not where it is not
     :param action_noise: noise added to normalised options while exploring
@@ -162,6 +161,9 @@ class CTCO(SoftOptionActorCritic):
         d_max: float = 1.0,
         d_min: float | None = None,
         dt: float | None = None,
+        trajectory: str | type[Trajectory] = "rbf",
+        duration_scale: DurationScale = "linear",
+        reward_scale: float | Literal["gamma_dt"] = 1.0,
         high_freq_penalty: float | Schedule = 0.003,
         target_decision_rate: float | None = None,
         ent_coef: str | float = "auto_0.02",
@@ -187,6 +189,11 @@ class CTCO(SoftOptionActorCritic):
             raise ValueError(f"entropy_reference must be one of {ENTROPY_REFERENCES}, not {entropy_reference!r}")
         if not 0.0 <= target_entropy_anneal <= 1.0:
             raise ValueError(f"target_entropy_anneal must be a fraction of training in [0, 1], not {target_entropy_anneal}")
+        if entropy_reference == "paper" and duration_scale != "linear":
+            raise ValueError(
+                "entropy_reference='paper' is of densities over d in s, so it needs duration_scale='linear', not "
+                f"{duration_scale!r}"
+            )
         if target_decision_rate is not None and not target_decision_rate > 0:
             raise ValueError(f"target_decision_rate must be a positive number of Hz or None, not {target_decision_rate}")
         if target_decision_rate is not None and not (isinstance(high_freq_penalty, int | float) and high_freq_penalty > 0):
@@ -202,6 +209,9 @@ class CTCO(SoftOptionActorCritic):
             d_max=d_max,
             d_min=d_min,
             dt=dt,
+            trajectory=trajectory,
+            duration_scale=duration_scale,
+            reward_scale=reward_scale,
             gamma=gamma,
             gamma_dt=gamma_dt,
             updates_per_second=updates_per_second,
@@ -254,6 +264,9 @@ class CTCO(SoftOptionActorCritic):
             "n_sub_options": 0,
             "n_rbf": 3,
             "high_freq_penalty": 0.05,
+            "reward_scale": 1.0,
+            "trajectory": "rbf",
+            "duration_scale": "linear",
             "entropy_reference": "paper",
             "policy_kwargs": {"n_critics": 1, "net_arch": {"pi": [10, 10], "qf": [64, 64]}},
         }
@@ -269,10 +282,14 @@ class CTCO(SoftOptionActorCritic):
             self.high_freq_penalty_optimizer = th.optim.Adam([self.log_high_freq_penalty], lr=self.lr_schedule(1))
             #: What the replay buffer had counted at the last training: decisions, and their time in s.
             self._counted_decisions = (0, 0.0)
+        self._last_next_values: tuple[th.Tensor, th.Tensor] | None = None
+        self._set_log_reference()
+
+    def _set_log_reference(self) -> None:
         assert self.d_min is not None
-        self._log_reference = log_reference_density(self.actor.omega_dim, self.d_min, self.d_max, self.entropy_reference).to(
-            self.device
-        )
+        targets = th.tensor(self._current_target_entropies())
+        reference = log_reference_density(self.actor.omega_dim, self.d_min, self.d_max, self.entropy_reference, targets)
+        self._log_reference = reference.to(self.device)
 
     def _networks_and_targets(self) -> list[tuple[nn.Module, nn.Module]]:
         return [*super()._networks_and_targets(), (self.actor, self.actor_target)]
@@ -297,18 +314,13 @@ class CTCO(SoftOptionActorCritic):
             step_size = FloatSchedule(self.duration_learning_rate)(self._current_progress_remaining)
             self.actor.optimizer.param_groups[1]["lr"] = step_size
 
-    def entropy_costs(self, options: th.Tensor, log_prob: th.Tensor) -> th.Tensor:
+    def entropy_costs(self, log_prob: th.Tensor) -> th.Tensor:
         """β_E log π relative to the reference, ω's and d's with their own temperature.
 
-        :param options: ``[batch, omega_dim + 1]``, normalised
         :param log_prob: log π(ω|s) and log π(d|s) of those, ``[batch, 2]``
         :return: ``[batch, 1]``
         """
-        costs = ((log_prob - self._log_reference) @ self.ent_coefs)[:, None]
-        if self.entropy_reference != "duration":
-            return costs
-        assert self.d_min is not None
-        return costs * duration_weight(options[:, -1:], self.d_min, self.d_max, self.discount_rate)
+        return ((log_prob - self._log_reference) @ self.ent_coefs)[:, None]
 
     def _sample_policy(self, obs: PyTorchObs) -> tuple[th.Tensor, ...]:
         return self.actor.option_log_prob(obs)
@@ -316,7 +328,7 @@ class CTCO(SoftOptionActorCritic):
     def _critic_targets(self, data: ReplayBufferSamples) -> th.Tensor:
         next_options, next_log_prob = self.actor_target.option_log_prob(data.next_observations)
         next_q_values = self.critic_target(data.next_observations, next_options)
-        return self._targets(data, next_q_values, self.entropy_costs(next_options, next_log_prob))
+        return self._targets(data, next_q_values, self.entropy_costs(next_log_prob))
 
     def _targets(self, data: ReplayBufferSamples, next_q_values: th.Tensor, next_entropy_costs: th.Tensor) -> th.Tensor:
         """What the critics learn, ``[batch, 1]``.
@@ -325,6 +337,7 @@ class CTCO(SoftOptionActorCritic):
         :param next_entropy_costs: of those, ``[batch, 1]``
         """
         assert data.discounts is not None
+        self._last_next_values = (next_q_values, next_entropy_costs)
         return critic_target(
             data.rewards,
             data.dones,
@@ -336,7 +349,7 @@ class CTCO(SoftOptionActorCritic):
 
     def _actor_loss(self, obs: PyTorchObs, sample: tuple[th.Tensor, ...]) -> th.Tensor:
         options, log_prob = sample
-        return actor_loss(self.critic(obs, options), self.entropy_costs(options, log_prob))
+        return actor_loss(self.critic(obs, options), self.entropy_costs(log_prob))
 
     def train(self, gradient_steps: int, batch_size: int = 64) -> None:
         """Sample the replay buffer and update temperatures, critics, actor and targets.
@@ -346,8 +359,15 @@ class CTCO(SoftOptionActorCritic):
         """
         if self.target_decision_rate is not None:
             self._update_high_freq_penalty()
+        self._set_log_reference()
         super().train(gradient_steps, batch_size)
         self.logger.record("option/high_freq_penalty", self._current_high_freq_penalty())
+        if self._last_next_values is None:
+            return  # A subclass has targets of its own.
+        # What a decision costs beside it, in the last batch: of entropy, and of taking the smallest of the critics' values.
+        next_q_values, next_entropy_costs = self._last_next_values
+        self.logger.record("option/entropy_price", next_entropy_costs.mean().item())
+        self.logger.record("option/critic_spread", (next_q_values.amax(dim=0) - next_q_values.amin(dim=0)).mean().item())
 
     @contextlib.contextmanager
     def _begin_updates(self) -> Iterator[Callable[[ReplayBufferSamples], th.Tensor]]:
@@ -417,7 +437,8 @@ class CTCO(SoftOptionActorCritic):
         )
 
     def _excluded_save_params(self) -> list[str]:
-        return [*super()._excluded_save_params(), "actor_target", "_log_reference", "_fast_update", "fast_updates_refusal"]
+        derived = ["actor_target", "_log_reference", "_last_next_values", "_fast_update", "fast_updates_refusal"]
+        return [*super()._excluded_save_params(), *derived]
 
     def _get_torch_save_params(self) -> tuple[list[str], list[str]]:
         state_dicts, tensors = super()._get_torch_save_params()

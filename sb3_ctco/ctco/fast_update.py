@@ -60,7 +60,6 @@ class FastUpdate:
         reasons = {
             f"{type(model).__name__} is a subclass of CTCO, which may have losses of its own": type(model) is not CTCO,
             f"the model has methods of its own: {overridden}": overridden,
-            "entropy_reference='duration'": model.entropy_reference == "duration",
             "the networks are others than linear layers with rectifiers between them": not plain_networks,
             "the features extractor has something to learn": any(
                 type(network.features_extractor) is not FlattenExtractor for network in networks
@@ -121,7 +120,7 @@ class FastUpdate:
         q_values, next_q_values = self._critics.forward(
             inputs[:, None].expand(-1, n_critics, -1, -1).flatten(end_dim=1)
         ).split(n_critics)
-        targets = model._targets(data, next_q_values, model.entropy_costs(options[1], log_prob[1]))
+        targets = model._targets(data, next_q_values, model.entropy_costs(log_prob[1]))
         self._critics.backward((q_values - targets) / batch_size)
         self._critic_adam.step()
         q_loss = critic_loss(q_values, targets)
@@ -129,7 +128,7 @@ class FastUpdate:
         inputs = th.cat((features[0], options[0]), dim=1)
         q_values = self._critics.forward(inputs.expand(n_critics, -1, -1))
         q_min = q_values.amin(dim=0)
-        pi_loss = (model.entropy_costs(options[0], log_prob[0]) - q_min).mean()
+        pi_loss = (model.entropy_costs(log_prob[0]) - q_min).mean()
         option_gradient = self._critics.input_gradient((q_values == q_min) / -batch_size, first=features.shape[2])
         self._actors.backward(option_gradient, model.ent_coefs / batch_size)
         self._actor_adam.step()

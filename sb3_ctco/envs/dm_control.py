@@ -11,6 +11,8 @@ import gymnasium as gym
 import numpy as np
 from gymnasium import spaces
 
+from sb3_ctco.wrappers.gymnasium_mujoco import rollout_inputs
+
 try:
     import mujoco
     from mujoco.rollout import Rollout
@@ -28,7 +30,7 @@ Rewards = Callable[[np.ndarray, np.ndarray, np.ndarray], np.ndarray]
 
 #: Rewards of the steps that ran, dm_control's discount if the episode ended, and the observations on the way
 _Played = tuple[np.ndarray, float | None, Sequence[np.ndarray] | np.ndarray]
-_STATE = int(mujoco.mjtState.mjSTATE_FULLPHYSICS)
+_STATE, _USER = int(mujoco.mjtState.mjSTATE_FULLPHYSICS), int(mujoco.mjtState.mjSTATE_USER)
 
 
 class DMControlEnv(gym.Env[np.ndarray, np.ndarray]):
@@ -81,7 +83,8 @@ class DMControlEnv(gym.Env[np.ndarray, np.ndarray]):
         if sparse and domain not in _SPARSE_REWARDS:
             raise ValueError(f"{domain} has no sparse reward here; these domains have one: {sorted(_SPARSE_REWARDS)}")
         with _without_deprecations():
-            env = suite.load(domain, task)
+            # Some models are drawn at random (lqr's): the same one each time. What reset draws follows from its seed.
+            env = suite.load(domain, task, task_kwargs={"random": 0})
         self._task = env.task
         self._physics = env.physics
         self._model: mujoco.MjModel = env.physics.model.ptr
@@ -192,19 +195,20 @@ class DMControlEnv(gym.Env[np.ndarray, np.ndarray]):
         leaves them, repeats mj_step1 once and is otherwise the same.
         """
         model, data, n_sub_steps = self._model, self._data, self._n_sub_steps
-        ctrl = np.repeat(np.asarray(actions, dtype=np.float64)[None], n_sub_steps, axis=1)
+        inputs = rollout_inputs(model, data, actions, n_sub_steps)
         start = np.empty((1, mujoco.mj_stateSize(model, _STATE)))
         mujoco.mj_getState(model, data, start[0], _STATE)
-        states = np.empty((1, ctrl.shape[1], start.shape[1]))
+        states = np.empty((1, inputs.shape[1], start.shape[1]))
         # The sensors of a step are those of the state that it starts in; the last state's are read from the data.
-        sensors = np.empty((1, ctrl.shape[1] + 1, model.nsensordata))
+        sensors = np.empty((1, inputs.shape[1] + 1, model.nsensordata))
         self._rollout.rollout(
             [model],
             [data],
             start,
-            ctrl,
+            inputs,
+            control_spec=_USER,
             skip_checks=True,
-            nstep=ctrl.shape[1],
+            nstep=inputs.shape[1],
             initial_warmstart=data.qacc_warmstart[None].copy(),
             state=states,
             sensordata=sensors[:, :-1],
@@ -214,7 +218,8 @@ class DMControlEnv(gym.Env[np.ndarray, np.ndarray]):
         # A full state is time, qpos, qvel, …
         joints = states[0, n_sub_steps - 1 :: n_sub_steps, 1 : 1 + model.nq + model.nv]
         assert self._rewards is not None
-        rewards = self._rewards(joints[:, : model.nq], sensors[0, n_sub_steps::n_sub_steps], ctrl[0, ::n_sub_steps])
+        ctrl = inputs[0, ::n_sub_steps, : model.nu]
+        rewards = self._rewards(joints[:, : model.nq], sensors[0, n_sub_steps::n_sub_steps], ctrl)
         return rewards, None, list(joints[[k - 1 for k in observe], self._first_joint :].astype(np.float32))
 
     def render(self) -> np.ndarray | None:  # type: ignore[override]

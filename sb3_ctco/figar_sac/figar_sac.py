@@ -23,7 +23,7 @@ from sb3_ctco.figar_sac.policies import (
     decode_repetitions,
     encode_repetitions,
 )
-from sb3_ctco.options import OptionSettings, steps_in
+from sb3_ctco.options import OptionSpace, steps_in
 from sb3_ctco.wrappers import OptionExecutionWrapper, find_dt
 
 SelfFiGARSAC = TypeVar("SelfFiGARSAC", bound="FiGARSAC")
@@ -217,7 +217,7 @@ class FiGARSAC(SoftOptionActorCritic):
             )
         if d_max is None:
             d_max = (20 if n_repetitions is None else n_repetitions) * dt
-        return super().wrapper_kwargs({**arguments, "n_rbf": 1, "d_max": d_max, "d_min": None})
+        return super().wrapper_kwargs({**arguments, "n_rbf": 1, "d_max": d_max, "d_min": None, "duration_scale": "linear"})
 
     def _resolve_repetitions(self, dt: float) -> None:
         """Make ``n_repetitions`` and ``d_max``, of which the user gave one, say the same at the first dt that is known."""
@@ -243,12 +243,12 @@ class FiGARSAC(SoftOptionActorCritic):
         if self.dt is not None:
             self._resolve_repetitions(self.dt)
         elif isinstance(env, VecEnv):
-            self._resolve_repetitions(env.get_attr("option_settings")[0].dt)
+            self._resolve_repetitions(env.get_attr("option_space")[0].dt)
         else:
-            self._resolve_repetitions(env.get_wrapper_attr("option_settings").dt)
+            self._resolve_repetitions(env.get_wrapper_attr("option_space").dt)
         return env
 
-    def _check_env(self, env: VecEnv) -> OptionSettings:
+    def _check_env(self, env: VecEnv) -> OptionSpace:
         settings = super()._check_env(env)
         if not np.isclose(settings.d_min, settings.dt, rtol=1e-6, atol=0.0):
             raise ValueError(
@@ -276,21 +276,13 @@ class FiGARSAC(SoftOptionActorCritic):
             action[:, -1] = buffer_action[:, -1] = encode_repetitions(index + 1.0, self.n_repetitions)
         return action, buffer_action
 
-    def _store_transition(
-        self,
-        replay_buffer: ReplayBuffer,
-        buffer_action: np.ndarray,
-        new_obs: np.ndarray | dict[str, np.ndarray],
-        reward: np.ndarray,
-        dones: np.ndarray,
-        infos: list[dict[str, Any]],
-    ) -> None:
+    def _see_what_ran(self, options: np.ndarray, infos: list[dict[str, Any]]) -> None:
         # What ran is what was asked for, unless the episode's end cut it short: then it equals a shorter repetition.
         assert self.n_repetitions is not None
-        n_steps = np.array([info["option"]["n_steps"] for info in infos], dtype=np.float32)
-        buffer_action = buffer_action.copy()
-        buffer_action[:, -1] = encode_repetitions(n_steps, self.n_repetitions)
-        super()._store_transition(replay_buffer, buffer_action, new_obs, reward, dones, infos)
+        for option, info in zip(options, infos, strict=True):
+            if "option" in info:
+                n_steps = np.array(info["option"]["n_steps"], dtype=np.float32)
+                option[-1] = encode_repetitions(n_steps, self.n_repetitions)
 
     def _sample_policy(self, obs: PyTorchObs) -> tuple[th.Tensor, ...]:
         actions, action_log_prob, repetition_log_probs = self.actor.action_log_prob(obs)

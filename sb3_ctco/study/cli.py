@@ -24,8 +24,11 @@ def main(arguments: Sequence[str] | None = None) -> int:
     try:
         return args.call(args)
     except ModuleNotFoundError as error:
-        missing, clone = (error.name or str(error)).partition(".")[0], "in a clone of sb3-ctco, run pip install '.[study]'"
-        print(f"sb3-ctco study {args.command}: {missing} is missing: {clone}", file=sys.stderr)
+        missing = (error.name or str(error)).partition(".")[0]
+        print(
+            f"sb3-ctco study {args.command}: {missing} is missing: in a clone of sb3-ctco, run pip install '.[study]'",
+            file=sys.stderr,
+        )
         return FAILED
     except (ValueError, ImportError) as error:
         print(f"sb3-ctco study {args.command}: {error}", file=sys.stderr)
