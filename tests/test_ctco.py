@@ -546,7 +546,7 @@ def test_a_wrapped_environment_is_used_as_it_is(random_walk_env):
     ("wrapper", "algorithm", "name"),
     [
         ({"n_rbf": 2}, {}, "n_rbf"),
-        ({"d_max": 0.5}, {}, "d_max"),
+        ({"d_max": 0.6}, {}, "d_max"),
         ({"d_min": 0.2}, {"d_min": 0.3}, "d_min"),
         ({}, {"dt": 0.2}, "dt"),
         ({"discount_rate": 0.1}, {}, "discount_rate"),

@@ -248,7 +248,7 @@ class OptionExecutionWrapper(gym.Wrapper, RecordConstructorArgs):
         self,
         env: gym.Env,
         n_rbf: int = 3,
-        d_max: float = 1.0,
+        d_max: float = 0.5,
         d_min: float | None = None,
         dt: float | None = None,
         discount_rate: float = DEFAULT_DISCOUNT_RATE,

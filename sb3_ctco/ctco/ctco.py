@@ -58,6 +58,11 @@ def log_reference_density(
     return th.tensor([0.0, math.log((d_max - d_min) / 2.0) if d_max > d_min else 0.0])
 
 
+def _longest(d_max: float | None, gamma_dt: float) -> float:
+    """The longest duration, in s: by default what follows from the horizon as the user states it."""
+    return 10.0 * gamma_dt if d_max is None else d_max
+
+
 class CTCO(SoftOptionActorCritic):
     """Continuous-Time Continuous-Options (CTCO).
 
@@ -93,7 +98,7 @@ class CTCO(SoftOptionActorCritic):
     :param n_sub_options: how many random stretches of each option that was played go into the replay buffer beside it,
         as options of their own, which counts in ``buffer_size``; 0 is the paper's way
     :param n_rbf: number of radial basis functions an action dimension
-    :param d_max: longest duration of an option, in s
+    :param d_max: longest duration of an option, in s; ten ``gamma_dt`` by default
     :param d_min: shortest duration, in s; by default one step of the environment
     :param dt: interaction period of the environment, in s; by default found in the environment
     :param trajectory: how ω becomes actions: ``"rbf"``, the paper's radial basis functions, ``"bezier"``, or a subclass of
@@ -158,7 +163,7 @@ class CTCO(SoftOptionActorCritic):
         updates_per_second: float | None = None,
         n_sub_options: int = 8,
         n_rbf: int = 3,
-        d_max: float = 1.0,
+        d_max: float | None = None,
         d_min: float | None = None,
         dt: float | None = None,
         trajectory: str | type[Trajectory] = "rbf",
@@ -206,7 +211,7 @@ class CTCO(SoftOptionActorCritic):
             env,
             learning_rate,
             n_rbf=n_rbf,
-            d_max=d_max,
+            d_max=_longest(d_max, gamma_dt),
             d_min=d_min,
             dt=dt,
             trajectory=trajectory,
@@ -245,6 +250,14 @@ class CTCO(SoftOptionActorCritic):
 
         if _init_setup_model:
             self._setup_model()
+
+    @classmethod
+    def wrapper_kwargs(cls, arguments: dict[str, Any]) -> dict[str, Any]:
+        """OptionExecutionWrapper's arguments for the algorithm's, where environments are made before it.
+
+        :param arguments: the algorithm's arguments, defaults included
+        """
+        return super().wrapper_kwargs({**arguments, "d_max": _longest(arguments["d_max"], arguments["gamma_dt"])})
 
     @staticmethod
     def paper_defaults() -> dict[str, Any]:
