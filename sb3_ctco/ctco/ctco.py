@@ -23,8 +23,8 @@ __all__ = ["CTCO", "actor_loss", "critic_loss", "critic_target", "log_reference_
 
 SelfCTCO = TypeVar("SelfCTCO", bound="CTCO")
 
-EntropyReference = Literal["uniform", "target", "paper"]
-ENTROPY_REFERENCES: tuple[EntropyReference, ...] = ("uniform", "target", "paper")
+EntropyReference = Literal["uniform", "average", "paper"]
+ENTROPY_REFERENCES: tuple[EntropyReference, ...] = ("uniform", "average", "paper")
 
 
 def actor_loss(q_values: th.Tensor, entropy_costs: th.Tensor) -> th.Tensor:
@@ -37,23 +37,22 @@ def actor_loss(q_values: th.Tensor, entropy_costs: th.Tensor) -> th.Tensor:
 
 
 def log_reference_density(
-    omega_dim: int, d_min: float, d_max: float, reference: EntropyReference, target_entropies: th.Tensor
+    omega_dim: int, d_min: float, d_max: float, reference: EntropyReference, log_prob: th.Tensor
 ) -> th.Tensor:
     """Log-density of what entropy is counted relative to, over the normalised option box.
 
     ``"uniform"`` is the uniform distribution over all options: log π − log u is never negative on average, so
     a decision is never paid for its entropy, and a policy of little entropy pays for each decision.
-    ``"target"`` is minus the target entropy: log π + H̄ is zero on average once learned temperatures have settled, so that β_h
-    is all that a decision costs.
+    ``"average"`` is what the policy has on average over a batch: zero on average, so that β_h is all that a decision costs.
     ``"paper"`` is the unit density over (ω, d in s): log π as it stands.
 
-    :param target_entropies: of ω and of d, ``[2]``
+    :param log_prob: log π(ω|s) and log π(d|s) of a batch, ``[batch, 2]``
     :return: for ω and d, shape ``[2]``
     """
     if reference == "uniform":
         return th.tensor([-omega_dim * math.log(2.0), -math.log(2.0)])
-    if reference == "target":
-        return -target_entropies
+    if reference == "average":
+        return log_prob.mean(dim=0)
     # A duration in s has (d_max − d_min)/2 of the length of the box [−1, 1].
     return th.tensor([0.0, math.log((d_max - d_min) / 2.0) if d_max > d_min else 0.0])
 
@@ -118,7 +117,7 @@ class CTCO(SoftOptionActorCritic):
     :param target_entropy_anneal: the last fraction of training, in [0, 1], in which both target entropies fall, linearly, by
         one nat a dimension in all: explore first, then get precise; 0 keeps them
     :param duration_learning_rate: step size of d's head; ``learning_rate`` by default
-    :param entropy_reference: ``"uniform"``, ``"target"`` or ``"paper"``, see :func:`log_reference_density`
+    :param entropy_reference: ``"uniform"``, ``"average"`` or ``"paper"``, see :func:`log_reference_density`
     :param fast_updates: whether to compute gradients without autograd where that is known to give the same, see
         :mod:`sb3_ctco.ctco.fast_update`; ``fast_updates_refusal`` says why not where it is not
     :param action_noise: noise added to normalised options while exploring
@@ -296,13 +295,13 @@ class CTCO(SoftOptionActorCritic):
             #: What the replay buffer had counted at the last training: decisions, and their time in s.
             self._counted_decisions = (0, 0.0)
         self._last_next_values: tuple[th.Tensor, th.Tensor] | None = None
-        self._set_log_reference()
-
-    def _set_log_reference(self) -> None:
         assert self.d_min is not None
-        targets = th.tensor(self._current_target_entropies())
-        reference = log_reference_density(self.actor.omega_dim, self.d_min, self.d_max, self.entropy_reference, targets)
-        self._log_reference = reference.to(self.device)
+        # Read from the batch where it is "average"
+        self._log_reference: th.Tensor | None = None
+        if self.entropy_reference != "average":
+            self._log_reference = log_reference_density(
+                self.actor.omega_dim, self.d_min, self.d_max, self.entropy_reference, th.zeros(1, 2)
+            ).to(self.device)
 
     def _networks_and_targets(self) -> list[tuple[nn.Module, nn.Module]]:
         return [*super()._networks_and_targets(), (self.actor, self.actor_target)]
@@ -333,7 +332,8 @@ class CTCO(SoftOptionActorCritic):
         :param log_prob: log π(ω|s) and log π(d|s) of those, ``[batch, 2]``
         :return: ``[batch, 1]``
         """
-        return ((log_prob - self._log_reference) @ self.ent_coefs)[:, None]
+        reference = log_prob.mean(dim=0) if self._log_reference is None else self._log_reference
+        return ((log_prob - reference) @ self.ent_coefs)[:, None]
 
     def _sample_policy(self, obs: PyTorchObs) -> tuple[th.Tensor, ...]:
         return self.actor.option_log_prob(obs)
@@ -372,7 +372,6 @@ class CTCO(SoftOptionActorCritic):
         """
         if self.target_decision_rate is not None:
             self._update_high_freq_penalty()
-        self._set_log_reference()
         super().train(gradient_steps, batch_size)
         self.logger.record("option/high_freq_penalty", self._current_high_freq_penalty())
         if self._last_next_values is None:
