@@ -1,7 +1,9 @@
 """What must not mislead: files of other algorithms, buffers that do not fit, environments without a period, noise."""
 
+import shutil
 import subprocess
 import sys
+from pathlib import Path
 
 import gymnasium as gym
 import numpy as np
@@ -13,6 +15,8 @@ from sb3_ctco.common import option_algorithm
 from sb3_ctco.ctco import CTCOPolicy
 from sb3_ctco.dac_ppo import DACPolicy
 from sb3_ctco.figar_sac import FiGARSACPolicy
+
+ROOT = Path(__file__).parents[1]
 
 
 def small():
@@ -88,3 +92,23 @@ def test_dm_controls_deprecations_are_not_shown():
 def test_a_study_locks_without_fcntl_at_import():
     code = "import sys; sys.modules['fcntl'] = None; import sb3_ctco.study.runs"
     subprocess.run([sys.executable, "-c", code], check=True)
+
+
+def commands_of(target, folder):
+    """What make would run in a fresh clone."""
+    for name in ("Makefile", "pyproject.toml", "constraints.txt"):
+        shutil.copy(ROOT / name, folder)
+    command = ["make", "--dry-run", target, f"PYTHON={sys.executable}"]
+    return subprocess.run(command, capture_output=True, text=True, check=True, cwd=folder).stdout
+
+
+def test_make_demo_says_what_it_does_before_it_does_it(tmp_path):
+    commands = commands_of("demo", tmp_path)
+    said, done = commands.index("installing the package"), commands.index("pip install")
+    assert commands.index("making a virtual environment") < commands.index("-m venv") < said < done
+    assert commands.index("make demo: training") < commands.index("examples/quickstart.py")
+    assert "minutes" in commands[said:done]
+
+
+def test_make_test_fast_leaves_out_what_is_slow(tmp_path):
+    assert '-m "not slow" tests' in commands_of("test-fast", tmp_path)
