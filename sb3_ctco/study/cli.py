@@ -23,7 +23,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     args = _parser().parse_args(arguments)
     try:
         return args.call(args)
-    except (ValueError, ImportError) as error:
+    except (ValueError, ImportError, OSError) as error:  # an OSError is a file or folder that cannot be read or written
         print(f"sb3-ctco study {args.command}: {error}", file=sys.stderr)
         return FAILED
 

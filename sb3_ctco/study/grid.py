@@ -3,6 +3,8 @@
 import dataclasses
 import hashlib
 import json
+import math
+import re
 from collections.abc import Sequence
 from dataclasses import dataclass
 from importlib import resources
@@ -16,6 +18,8 @@ from sb3_ctco.envs import STUDY_RATES
 #: Tasks by their names in records, and what they are called in the ids of environments
 TASKS = {"point_mass": "point_mass-sparse", "cheetah": "cheetah-run", "ball_in_cup": "ball_in_cup-catch"}
 ALGORITHMS = ("ctco", "sac", "figar_sac", "dac_ppo")
+#: What the name of a setting may be: it becomes part of the name of a folder
+_SETTING = re.compile(r"\w[\w.+-]*", re.ASCII)
 #: Length of an episode, in s
 EPISODE_SECONDS = 10.0
 
@@ -131,12 +135,16 @@ def load_preset(name: str) -> Preset:
     :raises ValueError: if there is none, or something in it is not as it must be
     """
     if name in preset_names():
-        text = (resources.files("sb3_ctco.study") / "presets" / f"{name}.yml").read_text(encoding="utf-8")
+        content = (resources.files("sb3_ctco.study") / "presets" / f"{name}.yml").read_bytes()
     elif Path(name).is_file():
-        text, name = Path(name).read_text(encoding="utf-8"), Path(name).stem
+        content, name = Path(name).read_bytes(), Path(name).stem
     else:
         raise ValueError(f"there is no preset {name!r}: name one of {preset_names()}, or a YAML file")
-    return Preset(name, tuple(_grid(name, yaml.safe_load(text))))
+    try:
+        parsed = yaml.safe_load(content)
+    except (yaml.YAMLError, ValueError) as error:  # a date that there is not is a ValueError
+        raise ValueError(f"preset {name} is no YAML: {error}") from error
+    return Preset(name, tuple(_grid(name, parsed)))
 
 
 def _grid(preset: str, content: Any) -> list[Run]:
@@ -146,22 +154,34 @@ def _grid(preset: str, content: Any) -> list[Run]:
     _check_values(preset, "tasks", content["tasks"], tuple(TASKS))
     _check_values(preset, "rates", content["rates"], STUDY_RATES)
     for name in ("seeds", "eval_episodes"):
-        if not (isinstance(content[name], int) and content[name] >= 1):
+        # True is an integer to Python.
+        if isinstance(content[name], bool) or not (isinstance(content[name], int) and content[name] >= 1):
             raise ValueError(f"preset {preset}: {name} must be a whole number from 1, not {content[name]!r}")
     task_seconds = content["task_seconds"]
-    if not (isinstance(task_seconds, int | float) and task_seconds >= 10 * EPISODE_SECONDS):
+    if not (isinstance(task_seconds, int | float) and math.isfinite(task_seconds) and task_seconds >= 10 * EPISODE_SECONDS):
         raise ValueError(
             f"preset {preset}: task_seconds must be at least {10 * EPISODE_SECONDS:g}, so that an episode of "
-            f"{EPISODE_SECONDS:g} s ends in the last tenth, not {task_seconds!r}"
+            f"{EPISODE_SECONDS:g} s ends in the last tenth, and finite, not {task_seconds!r}"
+        )
+    if not (isinstance(content["algorithms"], dict) and content["algorithms"]):
+        raise ValueError(
+            f"preset {preset}: algorithms must be a mapping of names to setting and arguments, not {content['algorithms']!r}"
         )
     entries = []
     for name, entry in content["algorithms"].items():
         where = f"preset {preset}, algorithm {name}"
         _check_keys(where, entry, ("setting", "arguments"), optional=("algorithm",))
-        algorithm = entry.get("algorithm", name)
+        algorithm, setting, arguments = entry.get("algorithm", name), str(entry["setting"]), entry["arguments"]
         if algorithm not in ALGORITHMS:
             raise ValueError(f"{where}: must be one of {ALGORITHMS}, or name one of them as its algorithm, not {algorithm!r}")
-        entries.append((algorithm, str(entry["setting"]), dict(entry["arguments"])))
+        if entry["setting"] is None or not _SETTING.fullmatch(setting):
+            raise ValueError(
+                f"{where}: setting becomes part of a folder's name, so it must be of letters, digits and _ . + -, not "
+                f"{entry['setting']!r}"
+            )
+        if not (isinstance(arguments, dict) and all(isinstance(argument, str) for argument in arguments)):
+            raise ValueError(f"{where}: arguments must be a mapping of names to values ({{}} for none), not {arguments!r}")
+        entries.append((algorithm, setting, dict(arguments)))
     names = [entry[:2] for entry in entries]
     if len(set(names)) < len(names):
         raise ValueError(f"preset {preset}: two entries have the same algorithm and setting, in {names}")
@@ -179,9 +199,11 @@ def _check_keys(where: str, content: Any, required: Sequence[str], optional: Seq
         raise ValueError(f"{where}: must be a mapping with {[*required, *optional]}, not {content!r}")
     missing, unknown = set(required) - set(content), set(content) - {*required, *optional}
     if missing or unknown:
-        raise ValueError(f"{where}: {sorted(missing)} missing, {sorted(unknown)} unknown; it has {[*required, *optional]}")
+        raise ValueError(
+            f"{where}: {sorted(missing)} missing, {sorted(unknown, key=str)} unknown; it has {[*required, *optional]}"
+        )
 
 
 def _check_values(preset: str, name: str, given: Any, allowed: tuple[Any, ...]) -> None:
-    if not (isinstance(given, list) and given and set(given) <= set(allowed) and len(set(given)) == len(given)):
+    if not (isinstance(given, list) and given and all(one in allowed for one in given) and len(set(given)) == len(given)):
         raise ValueError(f"preset {preset}: {name} must be a list of some of {allowed}, each once, not {given!r}")
