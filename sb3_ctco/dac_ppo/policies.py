@@ -273,7 +273,8 @@ class DACPolicy(BasePolicy):
         """
         self.set_training_mode(False)
         # Stable-Baselines3's other policies look for this mistake in BasePolicy.predict, which has no place for a state.
-        if isinstance(observation, tuple) and len(observation) == 2 and isinstance(observation[1], dict):
+        given: Any = observation
+        if isinstance(given, tuple) and len(given) == 2 and isinstance(given[1], dict):
             raise ValueError(
                 "You have passed a tuple to predict: you are probably mixing Gym API with SB3 VecEnv API, "
                 "`obs, info = env.reset()` (Gym) and `obs = vec_env.reset()` (SB3 VecEnv)"
