@@ -28,6 +28,7 @@ from stable_baselines3.common.utils import LinearSchedule
 from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecMonitor, VecNormalize
 
 from sb3_ctco import CTCO, DACPPO, FiGARSAC, OptionExecutionWrapper, OptionReplayBuffer
+from sb3_ctco.option_array import plain
 
 _OFF_POLICY = {
     "learning_starts": 10,
@@ -159,7 +160,8 @@ def test_predict(learner, random_walk_env):
         assert action_space.contains(action.astype(action_space.dtype))
         actions, _ = model.predict(np.stack([observation] * 3), deterministic=deterministic)
         assert actions.shape == (3, *action_space.shape)
-    np.testing.assert_allclose(actions[0], model.predict(observation, deterministic=True)[0], rtol=1e-5)
+    # Of several options the array has the numbers; a row is an Option, no action.
+    np.testing.assert_allclose(plain(actions)[0], model.predict(observation, deterministic=True)[0], rtol=1e-5)
     assert not np.array_equal(model.predict(observation)[0], model.predict(observation)[0])
 
 
@@ -436,7 +438,7 @@ _CHANGES: dict[str, tuple[Any, Any]] = {
 }
 _REFUSED = {
     "d_max": 0.5,
-    "d_min": 0.2,
+    "reward_scale": 2.0,
     "dt": 0.05,
     "n_rbf": 2,
     "n_repetitions": 7,
