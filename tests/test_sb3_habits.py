@@ -437,7 +437,7 @@ _CHANGES: dict[str, tuple[Any, Any]] = {
     "ent_coef": (0.7, lambda model: model.ent_coef == 0.7),
 }
 _REFUSED = {
-    "d_max": 0.5,
+    "d_max": 0.6,
     "reward_scale": 2.0,
     "dt": 0.05,
     "n_rbf": 2,
