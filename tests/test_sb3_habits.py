@@ -438,8 +438,8 @@ _CHANGES: dict[str, tuple[Any, Any]] = {
 }
 _REFUSED = {
     "d_max": 0.6,
+    "d_min": 0.2,
     "reward_scale": 2.0,
-    "dt": 0.05,
     "n_rbf": 2,
     "n_repetitions": 7,
     "ent_coef": 0.7,
