@@ -13,7 +13,7 @@ from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecNorm
 from torch.distributions import Normal
 
 from sb3_ctco import CTCO, DictOptionReplayBuffer, OptionExecutionWrapper, OptionReplayBuffer
-from sb3_ctco.ctco.ctco import actor_loss, critic_loss, critic_target, log_reference_density
+from sb3_ctco.common.losses import actor_loss, critic_loss, critic_target, log_reference_density
 from sb3_ctco.ctco.policies import CTCOPolicy, EnsembleLinear, squashed_log_prob
 from sb3_ctco.options import DEFAULT_DISCOUNT_RATE, step_weight
 

@@ -14,47 +14,13 @@ from stable_baselines3.common.utils import FloatSchedule, update_learning_rate
 from torch import nn
 
 from sb3_ctco.common.buffers import DictOptionReplayBuffer, OptionReplayBuffer
-from sb3_ctco.common.soft_actor_critic import SoftOptionActorCritic, critic_loss, critic_target
+from sb3_ctco.common.losses import ENTROPY_REFERENCES, EntropyReference, actor_loss, critic_target, log_reference_density
+from sb3_ctco.common.soft_actor_critic import SoftOptionActorCritic
 from sb3_ctco.ctco.fast_update import FastUpdate
 from sb3_ctco.ctco.policies import CnnPolicy, CTCOPolicy, MlpPolicy, MultiInputPolicy, OptionActor, OptionCritic
 from sb3_ctco.options import DurationScale, Trajectory
 
-__all__ = ["CTCO", "actor_loss", "critic_loss", "critic_target", "log_reference_density"]
-
 SelfCTCO = TypeVar("SelfCTCO", bound="CTCO")
-
-EntropyReference = Literal["uniform", "average", "paper"]
-ENTROPY_REFERENCES: tuple[EntropyReference, ...] = ("uniform", "average", "paper")
-
-
-def actor_loss(q_values: th.Tensor, entropy_costs: th.Tensor) -> th.Tensor:
-    """L_π, equation (8) of the paper: its gradient runs through ω and d of reparameterised options.
-
-    :param q_values: ``[n_critics, batch, 1]``, of options that the policy sampled
-    :param entropy_costs: β_E log π of those options, ``[batch, 1]``
-    """
-    return (entropy_costs - q_values.amin(dim=0)).mean()
-
-
-def log_reference_density(
-    omega_dim: int, d_min: float, d_max: float, reference: EntropyReference, log_prob: th.Tensor
-) -> th.Tensor:
-    """Log-density of what entropy is counted relative to, over the normalised option box.
-
-    ``"uniform"`` is the uniform distribution over all options: log π − log u is never negative on average, so
-    a decision is never paid for its entropy, and a policy of little entropy pays for each decision.
-    ``"average"`` is what the policy has on average over a batch: zero on average, so that β_h is all that a decision costs.
-    ``"paper"`` is the unit density over (ω, d in s): log π as it stands.
-
-    :param log_prob: log π(ω|s) and log π(d|s) of a batch, ``[batch, 2]``
-    :return: for ω and d, shape ``[2]``
-    """
-    if reference == "uniform":
-        return th.tensor([-omega_dim * math.log(2.0), -math.log(2.0)])
-    if reference == "average":
-        return log_prob.mean(dim=0)
-    # A duration in s has (d_max − d_min)/2 of the length of the box [−1, 1].
-    return th.tensor([0.0, math.log((d_max - d_min) / 2.0) if d_max > d_min else 0.0])
 
 
 def _longest(d_max: float | None, gamma_dt: float) -> float:
