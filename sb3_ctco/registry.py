@@ -82,10 +82,10 @@ def find_task(name: str) -> Task:
 
     :raises ValueError: if there is none
     """
+    if not isinstance(name, str) or name not in {*TASKS, *gym.registry}:
+        raise ValueError(f"there is no task {name!r}: name one of {list(TASKS)}, or an id of Gymnasium's registry")
     if name in TASKS:
         return TASKS[name]
-    if name not in gym.registry:
-        raise ValueError(f"there is no task {name!r}: name one of {list(TASKS)}, or an id of Gymnasium's registry")
     if gym.spec(name).entry_point == "sb3_ctco.envs.dm_control:DMControlEnv" and "dt" not in gym.spec(name).kwargs:
         return Task(name, name.removeprefix("sb3_ctco/").removesuffix("-v0"), name)
     return Task(name, name, name, any_rate=False, episode_seconds=None)

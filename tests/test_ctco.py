@@ -13,7 +13,7 @@ from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecNorm
 from torch.distributions import Normal
 
 from sb3_ctco import CTCO, DictOptionReplayBuffer, OptionExecutionWrapper, OptionReplayBuffer
-from sb3_ctco.ctco.ctco import actor_loss, critic_loss, critic_target, log_reference_density
+from sb3_ctco.common.losses import actor_loss, critic_loss, critic_target, log_reference_density
 from sb3_ctco.ctco.policies import CTCOPolicy, EnsembleLinear, squashed_log_prob
 from sb3_ctco.options import DEFAULT_DISCOUNT_RATE, step_weight
 
@@ -58,7 +58,7 @@ def test_the_policy_gradient_runs_through_omega_and_d():
     matrix = th.randn(4, 4, dtype=th.float64)
     noise = th.randn(16, 3, dtype=th.float64)
     parameters = th.randn(6, dtype=th.float64).requires_grad_(True)
-    reference = log_reference_density(2, 0.1, 1.0, "uniform", th.zeros(2)).double()
+    reference = log_reference_density(2, 0.1, 1.0, "uniform", th.zeros(1, 2)).double()
     coefficients = th.tensor([0.3, 0.7], dtype=th.float64)
     scale = th.tensor([1.0, 1.0, 0.5], dtype=th.float64)
 
@@ -103,15 +103,46 @@ def test_densities_against_a_change_of_variables():
 
 
 def test_entropy_references():
-    targets = th.tensor([-6.0, -1.0])
+    log_prob = th.tensor([[5.0, 1.0], [7.0, 3.0]])
     # Uniform over [−1, 1]^6 and over [−1, 1]
-    uniform = log_reference_density(6, 0.1, 1.0, "uniform", targets)
+    uniform = log_reference_density(6, 0.1, 1.0, "uniform", log_prob)
     th.testing.assert_close(uniform, th.tensor([-6 * math.log(2.0), -math.log(2.0)]))
-    # A policy of the target entropy has log π = 6 and 1 on average, and pays nothing.
-    th.testing.assert_close(log_reference_density(6, 0.1, 1.0, "target", targets), th.tensor([6.0, 1.0]))
+    th.testing.assert_close(log_reference_density(6, 0.1, 1.0, "average", log_prob), th.tensor([6.0, 2.0]))
     # The unit density over ω and over d in s: [0.1, 2.1] s is as long as [−1, 1].
-    th.testing.assert_close(log_reference_density(6, 0.1, 2.1, "paper", targets), th.zeros(2))
-    th.testing.assert_close(log_reference_density(6, 0.1, 0.6, "paper", targets), th.tensor([0.0, math.log(0.25)]))
+    th.testing.assert_close(log_reference_density(6, 0.1, 2.1, "paper", log_prob), th.zeros(2))
+    th.testing.assert_close(log_reference_density(6, 0.1, 0.6, "paper", log_prob), th.tensor([0.0, math.log(0.25)]))
+
+
+def test_relative_to_the_average_a_decision_costs_nothing():
+    model = make(random_walk_like(), ent_coef=1.0, duration_ent_coef=0.5, entropy_reference="average")
+    # 5 and 7 are 1 off their mean, 1 and 3 likewise at half the temperature.
+    costs = model.entropy_costs(th.tensor([[5.0, 1.0], [7.0, 3.0]]))
+    th.testing.assert_close(costs, th.tensor([[-1.5], [1.5]]))
+
+
+@pytest.mark.slow
+def test_the_price_of_a_decision_is_the_penalty_alone(scripted_env):
+    """Where nothing is ever paid, long and short options are worth the same: without a penalty no duration is preferred.
+
+    The mean duration then is the one of most entropy, in the middle of 0.1 to 2 s.
+    """
+
+    def mean_duration(seed, **kwargs):
+        env = scripted_env(rewards=lambda step, action: 0.0, dt=0.1, truncate_at=50)
+        small = {"n_rbf": 1, "d_max": 2.0, "batch_size": 64, "policy_kwargs": {"net_arch": [32, 32]}, "learning_rate": 1e-3}
+        timing = {"gamma": 0.9, "gamma_dt": 0.1, "updates_per_second": 5, "learning_starts": 500}
+        temperatures = {"ent_coef": 0.1, "duration_ent_coef": 0.1}
+        model = make(env, **{**small, **timing, **temperatures, "seed": seed, **kwargs}).learn(6000)
+        obs = th.tensor([[count, 0.0] for count in range(0, 50, 5)]).repeat(200, 1)
+        with th.no_grad():
+            options, _ = model.actor.option_log_prob(obs)
+        return 0.1 + 0.5 * (options[:, -1].mean().item() + 1.0) * 1.9
+
+    free = [mean_duration(seed, high_freq_penalty=0.0, entropy_reference="average") for seed in range(3)]
+    np.testing.assert_allclose(free, 1.05, atol=0.1)
+    # A penalty lengthens options, and being paid for entropy shortens them.
+    assert mean_duration(0, high_freq_penalty=0.2, entropy_reference="average") > max(free) + 0.1
+    assert mean_duration(0, high_freq_penalty=0.0, entropy_reference="paper") < min(free) - 0.1
 
 
 def test_a_decision_is_never_paid_for_its_entropy():
@@ -122,12 +153,6 @@ def test_a_decision_is_never_paid_for_its_entropy():
     # With the paper's density the same policy is paid at each decision.
     model = make(random_walk_like(), ent_coef=1.0, duration_ent_coef=1.0, entropy_reference="paper")
     assert model.entropy_costs(log_prob).mean() < -0.5
-
-
-def test_the_target_entropy_is_followed_as_it_falls(random_walk_env):
-    model = make(random_walk_env(), entropy_reference="target", target_entropy_anneal=0.5, n_rbf=2).learn(200)
-    # In the end both have fallen by a nat a dimension: −2 − 2 and −1 − 1.
-    th.testing.assert_close(model._log_reference, th.tensor([4.0, 2.0]), rtol=0.05, atol=0.0)
 
 
 def test_paper_entropies_need_the_papers_durations():
@@ -546,7 +571,7 @@ def test_a_wrapped_environment_is_used_as_it_is(random_walk_env):
     ("wrapper", "algorithm", "name"),
     [
         ({"n_rbf": 2}, {}, "n_rbf"),
-        ({"d_max": 0.5}, {}, "d_max"),
+        ({"d_max": 0.6}, {}, "d_max"),
         ({"d_min": 0.2}, {"d_min": 0.3}, "d_min"),
         ({}, {"dt": 0.2}, "dt"),
         ({"discount_rate": 0.1}, {}, "discount_rate"),

@@ -16,8 +16,8 @@ from stable_baselines3.common.type_aliases import ReplayBufferSamples
 
 from sb3_ctco import FiGARSAC, OptionController, OptionExecutionWrapper, RewardRateWrapper
 from sb3_ctco.common import soft_actor_critic
+from sb3_ctco.common.losses import repeated_actor_loss, repetition_values
 from sb3_ctco.export import export_onnx
-from sb3_ctco.figar_sac.figar_sac import actor_loss, repetition_values
 from sb3_ctco.figar_sac.policies import FiGARSACPolicy, decode_repetitions, encode_repetitions
 from sb3_ctco.options import OptionSpace, discount
 
@@ -48,7 +48,7 @@ def test_expectation_over_repetitions_by_hand():
 
 def test_actor_loss_by_hand():
     # L_a = 0.2·(−1.5) − 2.5; L_x = −(2.5 + 0.5·H)
-    loss = actor_loss(Q_VALUES, th.tensor([-1.5]), LOG_PROBS, th.tensor([0.2, 0.5]))
+    loss = repeated_actor_loss(Q_VALUES, th.tensor([-1.5]), LOG_PROBS, th.tensor([0.2, 0.5]))
     assert loss.item() == pytest.approx(-0.3 - 2.5 - 2.5 - 0.5 * ENTROPY)
 
 
@@ -56,7 +56,7 @@ def test_each_part_of_the_policy_is_moved_with_the_other_one_held_fixed():
     q_values = Q_VALUES.clone().requires_grad_(True)
     logits = LOG_PROBS.clone().requires_grad_(True)
     log_prob = th.tensor([-1.5], requires_grad=True)
-    actor_loss(q_values, log_prob, logits.log_softmax(dim=1), th.tensor([0.2, 0.5])).backward()
+    repeated_actor_loss(q_values, log_prob, logits.log_softmax(dim=1), th.tensor([0.2, 0.5])).backward()
     # The action climbs Σ_k π_x(k)·min_i Q_k: −π_x for the smaller critic of each k, through L_a alone.
     th.testing.assert_close(q_values.grad, th.tensor([[[-0.25, 0.0]], [[0.0, -0.75]]]))
     assert log_prob.grad.item() == pytest.approx(0.2)

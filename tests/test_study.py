@@ -5,6 +5,7 @@ import dataclasses
 import json
 import math
 import os
+import re
 import shutil
 import signal
 import subprocess
@@ -140,6 +141,10 @@ def test_seconds_become_steps(algorithm, rate):
     assert model.seed == 0
 
 
+def of_ctco(**changes):
+    return {"algorithms": {"ctco": {"setting": "a", "arguments": {}, **changes}}}
+
+
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
@@ -152,11 +157,71 @@ def test_seconds_become_steps(algorithm, rate):
         ({"task_seconds": 50}, "task_seconds must be at least 100, so that an episode of 10 s ends in the last tenth"),
         ({"step": 1}, r"\[\] missing, \['step'\] unknown"),
         ({"algorithms": {"ppo": {"setting": "a", "arguments": {}}}}, "must be one of .* not 'ppo'"),
+        ({"tasks": [{"cheetah": 1}]}, r"there is no task \{'cheetah': 1\}"),
+        ({"tasks": {"cheetah": {"arguments": [1]}}}, r"task cheetah: arguments must be a mapping .* not \[1\]"),
+        ({"seeds": True}, "seeds must be a whole number from 1, not True"),
+        ({"seeds": 1.0}, "seeds must be a whole number from 1, not 1.0"),
+        ({"eval_episodes": True}, "eval_episodes must be a whole number from 1, not True"),
+        ({"task_seconds": math.inf}, "task_seconds must be at least 100, .* and finite, not inf"),
+        ({"task_seconds": math.nan}, "task_seconds must be at least 100, .* and finite, not nan"),
+        ({"task_seconds": "long"}, "task_seconds must be at least 100, .* not 'long'"),
+        ({"algorithms": ["ctco"]}, r"algorithms must be a mapping of names to setting and arguments, not \['ctco'\]"),
+        ({"algorithms": {}}, "algorithms must be a mapping of names to setting and arguments, not {}"),
+        ({"algorithms": None}, "algorithms must be a mapping of names to setting and arguments, not None"),
+        ({"algorithms": {"ctco": None}}, r"algorithm ctco: must be a mapping with \['setting', 'arguments', 'algorithm'\]"),
+        (of_ctco(arguments=None), "arguments must be a mapping of names to values .* not None"),
+        (of_ctco(arguments=[1]), r"arguments must be a mapping of names to values .* not \[1\]"),
+        (of_ctco(arguments={3: 1}), r"arguments must be a mapping of names to values .* not \{3: 1\}"),
+        (of_ctco(algorithm=["ctco"]), r"must be one of .* not \['ctco'\]"),
+        (of_ctco(setting=None), "letters, digits and _ . . -, not None"),
+        (of_ctco(setting=""), "letters, digits and _ . . -, not ''"),
+        (of_ctco(setting="../../elsewhere"), "letters, digits and _ . . -, not '../../elsewhere'"),
+        (of_ctco(setting="/tmp"), "letters, digits and _ . . -, not '/tmp'"),
+        (of_ctco(setting=[1]), r"letters, digits and _ . . -, not \[1\]"),
     ],
 )
 def test_mistakes_in_a_preset(tmp_path, changes, message):
     with pytest.raises(ValueError, match=message):
         load_preset(tiny(tmp_path, **changes))
+
+
+@pytest.mark.parametrize(
+    ("content", "message"),
+    [
+        (b"tasks: [point_mass", "preset broken is no YAML: .*line 1"),
+        (b"tasks: \xff", "preset broken is no YAML: "),
+        (b"tasks: 2026-13-45", "preset broken is no YAML: "),
+        (b"!!python/object/apply:os.system ['true']", "preset broken is no YAML: .*could not determine a constructor"),
+        (b"", "preset broken: must be a mapping with .* not None"),
+        (b"{1: 2, step: 1}", r"preset broken: \['algorithms', .*\] missing, \[1, 'step'\] unknown"),
+        (b"[1, 2]", r"preset broken: must be a mapping with .* not \[1, 2\]"),
+    ],
+)
+def test_files_that_are_no_presets(tmp_path, content, message):
+    file = tmp_path / "broken.yml"
+    file.write_bytes(content)
+    with pytest.raises(ValueError, match=re.compile(message, re.DOTALL)):
+        load_preset(str(file))
+
+
+def test_folders_that_cannot_be_a_study(tmp_path, capsys):
+    preset, file = tiny(tmp_path), tmp_path / "file"
+    file.write_text("not a folder")
+    for arguments, message in [
+        (["run", "--preset", preset, "--folder", str(file)], "Not a directory"),
+        (["run", "--preset", preset, "--folder", str(file / "inside")], "Not a directory"),
+        (["run", "--preset", preset, "--folder", "/proc/nothing"], "/proc/nothing cannot be the study's folder: "),
+        (["run", "--preset", str(tmp_path)], "there is no preset"),
+        (["status", str(file)], "is no folder of a study"),
+        (["collect", str(tmp_path / "none"), "--into", str(tmp_path / "a.csv")], "there is no folder or CSV file"),
+    ]:
+        assert main(arguments) == 1, arguments
+        assert message in capsys.readouterr().err
+    settings = tmp_path / "study" / load_preset(preset).runs[0].name / "settings.json"
+    settings.parent.mkdir(parents=True)
+    settings.write_text('{"preset": ')
+    assert main(["run", "--preset", preset, "--folder", str(tmp_path / "study")]) == 1
+    assert f"{settings} is damaged" in capsys.readouterr().err
 
 
 def test_mistakes_on_the_command_line(tmp_path, capsys):

@@ -248,7 +248,7 @@ class OptionExecutionWrapper(gym.Wrapper, RecordConstructorArgs):
         self,
         env: gym.Env,
         n_rbf: int = 3,
-        d_max: float = 1.0,
+        d_max: float = 0.5,
         d_min: float | None = None,
         dt: float | None = None,
         discount_rate: float = DEFAULT_DISCOUNT_RATE,
@@ -332,8 +332,20 @@ class OptionExecutionWrapper(gym.Wrapper, RecordConstructorArgs):
         if seed is not None:
             self._slice_rng = np.random.default_rng(seed)
         self._last_obs = deepcopy(result[0]) if self.n_sub_options else None
-        self._play = _find_step_sequence(self.env, self.n_sub_options > 0) or self._step_in_a_loop
+        self._play = self._choose_play()
         return result
+
+    def _choose_play(self) -> StepSequence:
+        """What plays an option's actions until the episode ends."""
+        return _find_step_sequence(self.env, self.n_sub_options > 0) or self._step_in_a_loop
+
+    def __getstate__(self) -> dict[str, Any]:
+        # What plays is a function that belongs to this object, and to a simulation.
+        return {**vars(self), "_play": self._play is not None}
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        vars(self).update(state)
+        self._play = self._choose_play() if state["_play"] else None
 
     def step(self, action: npt.ArrayLike) -> tuple[Any, SupportsFloat, bool, bool, dict[str, Any]]:
         """Play one option.

@@ -96,8 +96,10 @@ class RealTimeOptionWrapper(OptionExecutionWrapper):
         self._abandoned = False
         obs, info = super().reset(seed=seed, options=options)
         self._decided_on = obs
-        self._play = self._play_around_decisions
         return obs, info
+
+    def _choose_play(self) -> StepSequence:
+        return self._play_around_decisions
 
     def abandon(self) -> None:
         """Stop playing, at the next primitive step; needs a reset then."""

@@ -10,39 +10,9 @@ from stable_baselines3.common.type_aliases import GymEnv, PyTorchObs, ReplayBuff
 from stable_baselines3.common.utils import FloatSchedule, get_parameters_by_name, polyak_update
 from torch import nn
 
+from sb3_ctco.common.losses import critic_loss
 from sb3_ctco.common.option_algorithm import OptionOffPolicyAlgorithm
 from sb3_ctco.common.policies import EnsembleCritic, SoftOptionPolicy, SquashedActor
-
-
-def critic_target(
-    integrated_rewards: th.Tensor,
-    dones: th.Tensor,
-    discounts: th.Tensor,
-    next_q_values: th.Tensor,
-    next_entropy_costs: th.Tensor,
-    high_freq_penalty: float = 0.0,
-) -> th.Tensor:
-    """``R − β_h + γ(d)·(Q̂_χ'(s', ω', d') − β_E log π(ω', d'|s'))``, the target in CTCO's L_Q (after equation (6)).
-
-    All tensors are ``[batch, 1]``.
-
-    :param integrated_rewards: R
-    :param dones: 1 where the episode terminated (not where it was truncated)
-    :param discounts: γ(d) = e^(−τ·duration)
-    :param next_q_values: smallest target Q-value of an option of the target policy
-    :param next_entropy_costs: β_E log π of that option
-    :param high_freq_penalty: β_h
-    """
-    return integrated_rewards - high_freq_penalty + (1.0 - dones) * discounts * (next_q_values - next_entropy_costs)
-
-
-def critic_loss(q_values: th.Tensor, targets: th.Tensor) -> th.Tensor:
-    """L_Q of CTCO's paper, as Stable-Baselines3's SAC scales it: half the mean square error, summed over critics.
-
-    :param q_values: ``[n_critics, batch, 1]``
-    :param targets: ``[batch, 1]``
-    """
-    return 0.5 * (q_values - targets).square().mean(dim=(1, 2)).sum()
 
 
 class SoftOptionActorCritic(OptionOffPolicyAlgorithm):

@@ -14,48 +14,18 @@ from stable_baselines3.common.utils import FloatSchedule, update_learning_rate
 from torch import nn
 
 from sb3_ctco.common.buffers import DictOptionReplayBuffer, OptionReplayBuffer
-from sb3_ctco.common.soft_actor_critic import SoftOptionActorCritic, critic_loss, critic_target
+from sb3_ctco.common.losses import ENTROPY_REFERENCES, EntropyReference, actor_loss, critic_target, log_reference_density
+from sb3_ctco.common.soft_actor_critic import SoftOptionActorCritic
 from sb3_ctco.ctco.fast_update import FastUpdate
 from sb3_ctco.ctco.policies import CnnPolicy, CTCOPolicy, MlpPolicy, MultiInputPolicy, OptionActor, OptionCritic
 from sb3_ctco.options import DurationScale, Trajectory
 
-__all__ = ["CTCO", "actor_loss", "critic_loss", "critic_target", "log_reference_density"]
-
 SelfCTCO = TypeVar("SelfCTCO", bound="CTCO")
 
-EntropyReference = Literal["uniform", "target", "paper"]
-ENTROPY_REFERENCES: tuple[EntropyReference, ...] = ("uniform", "target", "paper")
 
-
-def actor_loss(q_values: th.Tensor, entropy_costs: th.Tensor) -> th.Tensor:
-    """L_π, equation (8) of the paper: its gradient runs through ω and d of reparameterised options.
-
-    :param q_values: ``[n_critics, batch, 1]``, of options that the policy sampled
-    :param entropy_costs: β_E log π of those options, ``[batch, 1]``
-    """
-    return (entropy_costs - q_values.amin(dim=0)).mean()
-
-
-def log_reference_density(
-    omega_dim: int, d_min: float, d_max: float, reference: EntropyReference, target_entropies: th.Tensor
-) -> th.Tensor:
-    """Log-density of what entropy is counted relative to, over the normalised option box.
-
-    ``"uniform"`` is the uniform distribution over all options: log π − log u is never negative on average, so
-    a decision is never paid for its entropy, and a policy of little entropy pays for each decision.
-    ``"target"`` is minus the target entropy: log π + H̄ is zero on average once learned temperatures have settled, so that β_h
-    is all that a decision costs.
-    ``"paper"`` is the unit density over (ω, d in s): log π as it stands.
-
-    :param target_entropies: of ω and of d, ``[2]``
-    :return: for ω and d, shape ``[2]``
-    """
-    if reference == "uniform":
-        return th.tensor([-omega_dim * math.log(2.0), -math.log(2.0)])
-    if reference == "target":
-        return -target_entropies
-    # A duration in s has (d_max − d_min)/2 of the length of the box [−1, 1].
-    return th.tensor([0.0, math.log((d_max - d_min) / 2.0) if d_max > d_min else 0.0])
+def _longest(d_max: float | None, gamma_dt: float) -> float:
+    """The longest duration, in s: by default what follows from the horizon as the user states it."""
+    return 10.0 * gamma_dt if d_max is None else d_max
 
 
 class CTCO(SoftOptionActorCritic):
@@ -93,7 +63,7 @@ class CTCO(SoftOptionActorCritic):
     :param n_sub_options: how many random stretches of each option that was played go into the replay buffer beside it,
         as options of their own, which counts in ``buffer_size``; 0 is the paper's way
     :param n_rbf: number of radial basis functions an action dimension
-    :param d_max: longest duration of an option, in s
+    :param d_max: longest duration of an option, in s; ten ``gamma_dt`` by default
     :param d_min: shortest duration, in s; by default one step of the environment
     :param dt: interaction period of the environment, in s; by default found in the environment
     :param trajectory: how ω becomes actions: ``"rbf"``, the paper's radial basis functions, ``"bezier"``, or a subclass of
@@ -113,7 +83,7 @@ class CTCO(SoftOptionActorCritic):
     :param target_entropy_anneal: the last fraction of training, in [0, 1], in which both target entropies fall, linearly, by
         one nat a dimension in all: explore first, then get precise; 0 keeps them
     :param duration_learning_rate: step size of d's head; ``learning_rate`` by default
-    :param entropy_reference: ``"uniform"``, ``"target"`` or ``"paper"``, see :func:`log_reference_density`
+    :param entropy_reference: ``"uniform"``, ``"average"`` or ``"paper"``, see :func:`log_reference_density`
     :param fast_updates: whether to compute gradients without autograd where that is known to give the same, see
         :mod:`sb3_ctco.ctco.fast_update`; ``fast_updates_refusal`` says why not where it is not
     :param action_noise: noise added to normalised options while exploring
@@ -158,7 +128,7 @@ class CTCO(SoftOptionActorCritic):
         updates_per_second: float | None = None,
         n_sub_options: int = 8,
         n_rbf: int = 3,
-        d_max: float = 1.0,
+        d_max: float | None = None,
         d_min: float | None = None,
         dt: float | None = None,
         trajectory: str | type[Trajectory] = "rbf",
@@ -206,7 +176,7 @@ class CTCO(SoftOptionActorCritic):
             env,
             learning_rate,
             n_rbf=n_rbf,
-            d_max=d_max,
+            d_max=_longest(d_max, gamma_dt),
             d_min=d_min,
             dt=dt,
             trajectory=trajectory,
@@ -246,6 +216,14 @@ class CTCO(SoftOptionActorCritic):
         if _init_setup_model:
             self._setup_model()
 
+    @classmethod
+    def wrapper_kwargs(cls, arguments: dict[str, Any]) -> dict[str, Any]:
+        """OptionExecutionWrapper's arguments for the algorithm's, where environments are made before it.
+
+        :param arguments: the algorithm's arguments, defaults included
+        """
+        return super().wrapper_kwargs({**arguments, "d_max": _longest(arguments["d_max"], arguments["gamma_dt"])})
+
     @staticmethod
     def paper_defaults() -> dict[str, Any]:
         """The paper's algorithm as it stands, where it differs from the class's defaults.
@@ -283,13 +261,13 @@ class CTCO(SoftOptionActorCritic):
             #: What the replay buffer had counted at the last training: decisions, and their time in s.
             self._counted_decisions = (0, 0.0)
         self._last_next_values: tuple[th.Tensor, th.Tensor] | None = None
-        self._set_log_reference()
-
-    def _set_log_reference(self) -> None:
         assert self.d_min is not None
-        targets = th.tensor(self._current_target_entropies())
-        reference = log_reference_density(self.actor.omega_dim, self.d_min, self.d_max, self.entropy_reference, targets)
-        self._log_reference = reference.to(self.device)
+        # Read from the batch where it is "average"
+        self._log_reference: th.Tensor | None = None
+        if self.entropy_reference != "average":
+            self._log_reference = log_reference_density(
+                self.actor.omega_dim, self.d_min, self.d_max, self.entropy_reference, th.zeros(1, 2)
+            ).to(self.device)
 
     def _networks_and_targets(self) -> list[tuple[nn.Module, nn.Module]]:
         return [*super()._networks_and_targets(), (self.actor, self.actor_target)]
@@ -320,7 +298,8 @@ class CTCO(SoftOptionActorCritic):
         :param log_prob: log π(ω|s) and log π(d|s) of those, ``[batch, 2]``
         :return: ``[batch, 1]``
         """
-        return ((log_prob - self._log_reference) @ self.ent_coefs)[:, None]
+        reference = log_prob.mean(dim=0) if self._log_reference is None else self._log_reference
+        return ((log_prob - reference) @ self.ent_coefs)[:, None]
 
     def _sample_policy(self, obs: PyTorchObs) -> tuple[th.Tensor, ...]:
         return self.actor.option_log_prob(obs)
@@ -359,7 +338,6 @@ class CTCO(SoftOptionActorCritic):
         """
         if self.target_decision_rate is not None:
             self._update_high_freq_penalty()
-        self._set_log_reference()
         super().train(gradient_steps, batch_size)
         self.logger.record("option/high_freq_penalty", self._current_high_freq_penalty())
         if self._last_next_values is None:

@@ -18,8 +18,8 @@ from stable_baselines3.common.type_aliases import ReplayBufferSamples
 from torch import nn
 from torch.nn import functional as F
 
+from sb3_ctco.common.losses import critic_loss
 from sb3_ctco.common.policies import LOG_STD_MAX, LOG_STD_MIN, EnsembleLinear, affine
-from sb3_ctco.common.soft_actor_critic import critic_loss
 from sb3_ctco.ctco.policies import OptionActor, OptionCritic
 
 if TYPE_CHECKING:

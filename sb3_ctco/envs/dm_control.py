@@ -89,6 +89,7 @@ class DMControlEnv(gym.Env[np.ndarray, np.ndarray]):
         self._physics = env.physics
         self._model: mujoco.MjModel = env.physics.model.ptr
         self._data: mujoco.MjData = env.physics.data.ptr
+        self._name = (domain, task, sparse)
         self._uses_rk4 = self._model.opt.integrator == mujoco.mjtIntegrator.mjINT_RK4
 
         #: Control period, in s
@@ -101,8 +102,7 @@ class DMControlEnv(gym.Env[np.ndarray, np.ndarray]):
         self._step_limit = limit if math.isinf(limit) else max(1, round(limit / self.dt))
         self._steps_left: float = 0
 
-        make_rewards = _SPARSE_REWARDS.get(domain) if sparse else _REWARDS.get((domain, task))
-        self._rewards: Rewards | None = make_rewards(self._model, self._data) if make_rewards else None
+        self._rewards = self._make_rewards()
         self._first_joint = _FIRST_JOINTS.get(domain, 0)
         self._rollout = Rollout(nthread=0)
 
@@ -229,6 +229,25 @@ class DMControlEnv(gym.Env[np.ndarray, np.ndarray]):
     def close(self) -> None:
         """Free the renderer and the simulation."""
         self._physics.free()
+
+    def _make_rewards(self) -> Rewards | None:
+        domain, task, sparse = self._name
+        make_rewards = _SPARSE_REWARDS.get(domain) if sparse else _REWARDS.get((domain, task))
+        if make_rewards is None:
+            return None
+        # In the model's own position, so that the same numbers come out whatever the episode is at.
+        data = mujoco.MjData(self._model)
+        mujoco.mj_forward(self._model, data)
+        return make_rewards(self._model, data)
+
+    def __getstate__(self) -> dict[str, Any]:
+        # What refers to the simulation's memory is made anew.
+        return {name: value for name, value in vars(self).items() if name not in ("_model", "_data", "_rewards", "_rollout")}
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        vars(self).update(state)
+        self._model, self._data = self._physics.model.ptr, self._physics.data.ptr
+        self._rewards, self._rollout = self._make_rewards(), Rollout(nthread=0)
 
     def _flat_observation(self) -> np.ndarray:
         if self._rewards is not None:

@@ -12,7 +12,8 @@ from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, PyTorchObs, ReplayBufferSamples, Schedule
 from stable_baselines3.common.vec_env import VecEnv
 
-from sb3_ctco.common.soft_actor_critic import SoftOptionActorCritic, critic_target
+from sb3_ctco.common.losses import critic_target, repeated_actor_loss, repetition_values
+from sb3_ctco.common.soft_actor_critic import SoftOptionActorCritic
 from sb3_ctco.figar_sac.policies import (
     CnnPolicy,
     FiGARActor,
@@ -27,37 +28,6 @@ from sb3_ctco.options import OptionSpace, steps_in
 from sb3_ctco.wrappers import OptionExecutionWrapper, find_dt
 
 SelfFiGARSAC = TypeVar("SelfFiGARSAC", bound="FiGARSAC")
-
-
-def repetition_values(q_values: th.Tensor, repetition_log_probs: th.Tensor, duration_ent_coef: th.Tensor) -> th.Tensor:
-    """Σ_k π_x(k|s)·(min_i Q_i(s, a)_k − α_x log π_x(k|s)): the exact expectation over repetitions.
-
-    :param q_values: Q_i(s, a)_k, ``[n_critics, batch, K]``
-    :param repetition_log_probs: log π_x(k|s), ``[batch, K]``
-    :param duration_ent_coef: α_x, a scalar
-    :return: ``[batch, 1]``
-    """
-    soft_values = q_values.amin(dim=0) - duration_ent_coef * repetition_log_probs
-    return (repetition_log_probs.exp() * soft_values).sum(dim=1, keepdim=True)
-
-
-def actor_loss(
-    q_values: th.Tensor, action_log_prob: th.Tensor, repetition_log_probs: th.Tensor, ent_coefs: th.Tensor
-) -> th.Tensor:
-    """L_a + L_x, each part of the policy judged with the other one held fixed.
-
-    L_a = α_a log π_a(a|s) − Σ_k sg[π_x(k|s)]·min_i Q_i(s, a)_k moves the action, and
-    L_x = Σ_k π_x(k|s)·(α_x log π_x(k|s) − sg[min_i Q_i(s, a)_k]) the repetition; sg stops gradients.
-
-    :param q_values: Q_i(s, a)_k of reparameterised actions, ``[n_critics, batch, K]``
-    :param action_log_prob: log π_a(a|s), ``[batch]``
-    :param repetition_log_probs: log π_x(k|s), ``[batch, K]``
-    :param ent_coefs: α_a and α_x, ``[2]``
-    """
-    repetition_probs = repetition_log_probs.exp()
-    loss_a = ent_coefs[0] * action_log_prob - (repetition_probs.detach() * q_values.amin(dim=0)).sum(dim=1)
-    loss_x = -repetition_values(q_values.detach(), repetition_log_probs, ent_coefs[1])
-    return loss_a.mean() + loss_x.mean()
 
 
 class FiGARSAC(SoftOptionActorCritic):
@@ -312,7 +282,7 @@ class FiGARSAC(SoftOptionActorCritic):
 
     def _actor_loss(self, obs: PyTorchObs, sample: tuple[th.Tensor, ...]) -> th.Tensor:
         actions, log_prob, repetition_log_probs = sample
-        return actor_loss(self.critic(obs, actions), log_prob[:, 0], repetition_log_probs, self.ent_coefs)
+        return repeated_actor_loss(self.critic(obs, actions), log_prob[:, 0], repetition_log_probs, self.ent_coefs)
 
     def learn(
         self: SelfFiGARSAC,

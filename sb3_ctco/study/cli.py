@@ -30,7 +30,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
             file=sys.stderr,
         )
         return FAILED
-    except (ValueError, ImportError) as error:
+    except (ValueError, ImportError, OSError) as error:  # an OSError is a file or folder that cannot be read or written
         print(f"sb3-ctco study {args.command}: {error}", file=sys.stderr)
         return FAILED
 

@@ -4,6 +4,7 @@ import dataclasses
 import hashlib
 import json
 import math
+import re
 from collections.abc import Sequence
 from dataclasses import dataclass
 from importlib import resources
@@ -13,6 +14,9 @@ from typing import Any
 import yaml
 
 from sb3_ctco.registry import ALGORITHMS, find_task
+
+#: What the name of a setting may be: it becomes part of the name of a folder
+_SETTING = re.compile(r"\w[\w.+-]*", re.ASCII)
 
 
 @dataclass(frozen=True)
@@ -126,12 +130,16 @@ def load_preset(name: str) -> Preset:
     :raises ValueError: if there is none, or something in it is not as it must be
     """
     if name in preset_names():
-        text = (resources.files("sb3_ctco.study") / "presets" / f"{name}.yml").read_text(encoding="utf-8")
+        content = (resources.files("sb3_ctco.study") / "presets" / f"{name}.yml").read_bytes()
     elif Path(name).is_file():
-        text, name = Path(name).read_text(encoding="utf-8"), Path(name).stem
+        content, name = Path(name).read_bytes(), Path(name).stem
     else:
         raise ValueError(f"there is no preset {name!r}: name one of {preset_names()}, or a YAML file")
-    return Preset(name, tuple(_grid(name, yaml.safe_load(text))))
+    try:
+        parsed = yaml.safe_load(content)
+    except (yaml.YAMLError, ValueError) as error:  # a date that there is not is a ValueError
+        raise ValueError(f"preset {name} is no YAML: {error}") from error
+    return Preset(name, tuple(_grid(name, parsed)))
 
 
 _TASK_KEYS = ("rates", "task_seconds", "eval_episodes", "evaluations", "arguments")
@@ -142,7 +150,7 @@ def _grid(preset: str, content: Any) -> list[Run]:
     _check_keys(where, content, ("task_seconds", "eval_episodes", "tasks", "rates", "seeds", "algorithms"), ("evaluations",))
     tasks = content["tasks"]
     if isinstance(tasks, list):
-        tasks = {name: {} for name in tasks} if len(set(map(str, tasks))) == len(tasks) else None
+        tasks = {find_task(name).name: {} for name in tasks} if len(set(map(str, tasks))) == len(tasks) else None
     if not (isinstance(tasks, dict) and tasks):
         raise ValueError(f"{where}: tasks must be a list of tasks, each once, or a mapping, not {content['tasks']!r}")
     entries = _entries(where, content["algorithms"])
@@ -173,7 +181,7 @@ def _grid(preset: str, content: Any) -> list[Run]:
             seed,
             float(settings["task_seconds"]),
             settings["eval_episodes"],
-            {**arguments, **settings.get("arguments", {})},
+            {**arguments, **_checked_arguments(f"{where}, task {name}", settings.get("arguments", {}))},
             settings["evaluations"],
         )
         for seed in range(content["seeds"])
@@ -184,20 +192,33 @@ def _grid(preset: str, content: Any) -> list[Run]:
 
 def _entries(where: str, algorithms: Any) -> list[tuple[str, str, dict[str, Any]]]:
     """Algorithms with their settings and arguments."""
+    if not (isinstance(algorithms, dict) and algorithms):
+        raise ValueError(f"{where}: algorithms must be a mapping of names to setting and arguments, not {algorithms!r}")
     entries = []
     for name, entry in algorithms.items():
         of_entry = f"{where}, algorithm {name}"
         _check_keys(of_entry, entry, ("setting", "arguments"), optional=("algorithm",))
-        algorithm = entry.get("algorithm", name)
-        if algorithm not in ALGORITHMS:
+        algorithm, setting = entry.get("algorithm", name), str(entry["setting"])
+        if algorithm not in list(ALGORITHMS):
             raise ValueError(
                 f"{of_entry}: must be one of {list(ALGORITHMS)}, or name one of them as its algorithm, not {algorithm!r}"
             )
-        entries.append((algorithm, str(entry["setting"]), dict(entry["arguments"])))
+        if entry["setting"] is None or not _SETTING.fullmatch(setting):
+            raise ValueError(
+                f"{of_entry}: setting becomes part of a folder's name, so it must be of letters, digits and _ . + -, not "
+                f"{entry['setting']!r}"
+            )
+        entries.append((algorithm, setting, _checked_arguments(of_entry, entry["arguments"])))
     names = [entry[:2] for entry in entries]
     if len(set(names)) < len(names):
         raise ValueError(f"{where}: two entries have the same algorithm and setting, in {names}")
     return entries
+
+
+def _checked_arguments(where: str, arguments: Any) -> dict[str, Any]:
+    if not (isinstance(arguments, dict) and all(isinstance(name, str) for name in arguments)):
+        raise ValueError(f"{where}: arguments must be a mapping of names to values ({{}} for none), not {arguments!r}")
+    return dict(arguments)
 
 
 def _check_keys(where: str, content: Any, required: Sequence[str], optional: Sequence[str]) -> None:
@@ -205,11 +226,13 @@ def _check_keys(where: str, content: Any, required: Sequence[str], optional: Seq
         raise ValueError(f"{where}: must be a mapping with {[*required, *optional]}, not {content!r}")
     missing, unknown = set(required) - set(content), set(content) - {*required, *optional}
     if missing or unknown:
-        raise ValueError(f"{where}: {sorted(missing)} missing, {sorted(unknown)} unknown; it has {[*required, *optional]}")
+        raise ValueError(
+            f"{where}: {sorted(missing)} missing, {sorted(unknown, key=str)} unknown; it has {[*required, *optional]}"
+        )
 
 
 def _check_rates(where: str, rates: Any) -> None:
-    if not (isinstance(rates, list) and rates and len(set(rates)) == len(rates) and all(_is_whole(rate) for rate in rates)):
+    if not (isinstance(rates, list) and rates and all(map(_is_whole, rates)) and len(set(rates)) == len(rates)):
         raise ValueError(f"{where}: rates must be a list of whole numbers of Hz, each once, not {rates!r}")
 
 
@@ -223,7 +246,7 @@ def _check_seconds(where: str, task_seconds: Any, episode_seconds: float) -> Non
     if isinstance(task_seconds, bool) or not (isinstance(task_seconds, int | float) and shortest <= task_seconds < math.inf):
         raise ValueError(
             f"{where}: task_seconds must be at least {shortest:g}, so that an episode of {episode_seconds:g} s ends in the "
-            f"last tenth, not {task_seconds!r}"
+            f"last tenth, and finite, not {task_seconds!r}"
         )
 
 

@@ -49,15 +49,28 @@ class Outcome:
 def plan(runs: Sequence[Run], folder: Path) -> None:
     """Make the runs' folders, each with its settings.
 
-    :raises ValueError: if a folder has other settings
+    :raises ValueError: if a folder has other settings, or cannot be made
     """
     for run in runs:
         file = folder / run.name / SETTINGS
-        if file.exists():
-            _refuse_other_settings(run, json.loads(file.read_text()), file)
-        else:
-            file.parent.mkdir(parents=True, exist_ok=True)
-            write_whole(file, json.dumps(run.as_dict(), indent=1) + "\n")
+        try:
+            if file.exists():
+                _refuse_other_settings(run, _read_settings(file), file)
+            else:
+                file.parent.mkdir(parents=True, exist_ok=True)
+                write_whole(file, json.dumps(run.as_dict(), indent=1) + "\n")
+        except OSError as error:
+            raise ValueError(
+                f"{folder} cannot be the study's folder: {error}. Name another --folder, one that can be written to"
+            ) from error
+
+
+def _read_settings(file: Path) -> dict[str, Any]:
+    try:
+        settings: dict[str, Any] = json.loads(file.read_text())
+    except ValueError as error:
+        raise ValueError(f"{file} is damaged ({error}): delete {file.parent} to run it again") from error
+    return settings
 
 
 def _refuse_other_settings(run: Run, found: dict[str, Any], file: Path) -> None:
