@@ -44,9 +44,7 @@ class RecordEpisodes(gym.Wrapper, RecordConstructorArgs):
         gym.Wrapper.__init__(self, env)
         if env.render_mode != "rgb_array":
             raise ValueError(f"a video needs gymnasium.make(..., render_mode='rgb_array'), not {env.render_mode!r}")
-        dt = find_dt(env) if dt is None else dt
-        if dt is None:
-            raise ValueError(f"{env} does not tell its interaction period: pass dt, in seconds")
+        dt = find_dt(env, required_by=type(self).__name__) if dt is None else dt
         if not fps > 0:
             raise ValueError(f"fps must be positive, not {fps}")
         self.folder, self.name, self.dt, self.progress = Path(folder), name, dt, progress

@@ -9,7 +9,8 @@ import numpy as np
 from gymnasium.error import ResetNeeded
 from gymnasium.utils import RecordConstructorArgs
 
-from sb3_ctco.wrappers.option_execution import OptionExecutionWrapper, SequenceResult, StepSequence
+from sb3_ctco.wrappers.option_execution import OptionExecutionWrapper
+from sb3_ctco.wrappers.step_sequence import SequenceResult, StepSequence
 
 #: ``interrupt(observation of the last decision, observation, seconds since that one)``: whether to end the option
 Interrupt = Callable[[Any, Any, float], bool]

@@ -7,7 +7,8 @@ import numpy as np
 from gymnasium.utils import RecordConstructorArgs
 
 from sb3_ctco.options import DEFAULT_DISCOUNT_RATE, OptionSpace, discount, step_weight
-from sb3_ctco.wrappers.option_execution import check_observation, find_dt, reset_env
+from sb3_ctco.wrappers.checks import check_observation, reset_env
+from sb3_ctco.wrappers.timing import find_dt
 
 
 class RewardRateWrapper(gym.Wrapper, RecordConstructorArgs):
@@ -43,13 +44,7 @@ class RewardRateWrapper(gym.Wrapper, RecordConstructorArgs):
     ):
         RecordConstructorArgs.__init__(self, dt=dt, discount_rate=discount_rate, reward_scale=reward_scale)
         gym.Wrapper.__init__(self, env)
-        if dt is None:
-            dt = find_dt(env)
-        if dt is None:
-            raise ValueError(
-                f"{env} does not tell its interaction period (no unwrapped.dt, control_timestep() or "
-                "metadata['render_fps']): pass dt, in seconds, to RewardRateWrapper"
-            )
+        dt = find_dt(env, required_by="RewardRateWrapper") if dt is None else dt
         #: The clock: a step as an option of one step
         self.option_space = OptionSpace.make(1, d_max=dt, d_min=dt, dt=dt, discount_rate=discount_rate)
         self.reward_scale = reward_scale

@@ -11,8 +11,7 @@ from stable_baselines3.common.type_aliases import DictReplayBufferSamples, Repla
 from stable_baselines3.common.vec_env import VecNormalize
 
 from sb3_ctco.common.vec_env import PENDING
-from sb3_ctco.options import DEFAULT_DISCOUNT_RATE, discount
-from sb3_ctco.wrappers import SubOptions
+from sb3_ctco.options import DEFAULT_DISCOUNT_RATE, SubOptions, discount
 
 
 class _OptionStorage(ReplayBuffer):

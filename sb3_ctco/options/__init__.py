@@ -30,6 +30,7 @@ from sb3_ctco.options.semi_mdp import (
     steps_in,
 )
 from sb3_ctco.options.space import DURATION_SCALES, ActionBox, DurationScale, OptionSpace
+from sb3_ctco.options.sub_options import Stacked, SubOptions, draw_stretches, rows_of, shortest_steps, stack, sub_options
 from sb3_ctco.options.trajectory import TRAJECTORIES, BezierCurve, RadialBasis, Trajectory, basis_of_steps
 
 __all__ = [
@@ -45,12 +46,19 @@ __all__ = [
     "OptionSpace",
     "RadialBasis",
     "RewardUnit",
+    "Stacked",
+    "SubOptions",
     "Trajectory",
     "basis_of_steps",
     "discount",
     "discount_rate_from_gamma",
     "discounts_of_steps",
+    "draw_stretches",
     "integrated_reward",
+    "rows_of",
+    "shortest_steps",
+    "stack",
     "step_weight",
     "steps_in",
+    "sub_options",
 ]
