@@ -81,7 +81,7 @@ def test_a_step_is_an_option_of_one_step(dt, discount_rate, n_steps):
 
 
 def test_bad_wrapper_settings(scripted_env):
-    with pytest.raises(ValueError, match="pass dt, in seconds, .* or to RewardRateWrapper"):
+    with pytest.raises(ValueError, match=r"pass dt, in seconds, .* or to RewardRateWrapper"):
         RewardRateWrapper(scripted_env(dt=None))
     with pytest.raises(ValueError, match="dt must be a positive"):
         RewardRateWrapper(scripted_env(), dt=0.0)
