@@ -300,3 +300,21 @@ def test_option_spaces_tell_their_arguments_and_differences():
     ):
         with pytest.raises(ValueError, match=message):
             OptionSpace.make(**{**space.arguments, **arguments})
+
+
+@pytest.mark.parametrize("kind", TRAJECTORIES.values())
+def test_canonical_weights_play_the_same_and_are_the_same_for_all_that_do(kind):
+    trajectory, rng = kind(3), np.random.default_rng(0)
+    matrices = trajectory.canonical()
+    for n_steps in (1, 2, 3, 4):
+        matrix = matrices[min(n_steps, 3) - 1]
+        omega = rng.uniform(-1, 1, (2, 3))
+        canonical = omega @ matrix.T
+        np.testing.assert_allclose(trajectory.plan(canonical, n_steps), trajectory.plan(omega, n_steps), atol=1e-9)
+        # Weights that differ in what nothing feels
+        felt = basis_of_steps(trajectory, n_steps)
+        free = np.eye(3) - np.linalg.pinv(felt) @ felt
+        np.testing.assert_allclose((omega + rng.normal(size=(2, 3)) @ free) @ matrix.T, canonical, atol=1e-9)
+    # One step: all weights are the action.
+    np.testing.assert_allclose(np.ptp((omega @ matrices[0].T), axis=1), 0.0, atol=1e-9)
+    np.testing.assert_array_equal(matrices[2], np.eye(3))

@@ -27,6 +27,8 @@ def test_a_model_of_0_1_0_acts_as_it_did_and_learns_on(algorithm):
     # Its durations were linear, and R was in reward × s.
     assert model.option_space.duration_scale == "linear"
     assert model.replay_buffer.reward_scale == 1.0
+    if algorithm is CTCO:
+        assert model.canonical_options is None  # Its critics saw weights as they were.
     before = model._n_updates
     assert model.learn(60, reset_num_timesteps=False)._n_updates > before
 

@@ -88,6 +88,7 @@ class OptionOffPolicyAlgorithm(OffPolicyAlgorithm):
         "trajectory",
         "duration_scale",
         "reward_scale",
+        "canonical_weights",
         "n_repetitions",
         "ent_coef",
         "duration_ent_coef",
@@ -95,6 +96,9 @@ class OptionOffPolicyAlgorithm(OffPolicyAlgorithm):
     )
     #: An attribute that this class's files have and others' have not
     _own_setting: ClassVar[str] = "discount_rate"
+
+    #: Of arguments that older files do not have: what their networks were trained with
+    _before_it_was_saved: ClassVar[dict[str, Any]] = {"duration_scale": "linear", "reward_scale": 1.0}
 
     def __init__(
         self,
@@ -315,8 +319,9 @@ class OptionOffPolicyAlgorithm(OffPolicyAlgorithm):
         :raises ValueError: if the environment's settings differ from the file's, for an argument that cannot be changed, or if
             another algorithm wrote the file
         """
-        cls._refuse_files_of_others(path)
+        saved = cls._saved_attributes(path)
         kwargs = check_load_arguments(cls, path, kwargs, cls._kept_when_loaded)
+        kwargs.update({name: value for name, value in cls._before_it_was_saved.items() if saved and name not in saved})
         # Of two that say the same in different ways, the one that is given holds.
         if "gradient_steps" in kwargs:
             kwargs.setdefault("updates_per_second", None)
@@ -333,7 +338,11 @@ class OptionOffPolicyAlgorithm(OffPolicyAlgorithm):
         return model
 
     @classmethod
-    def _refuse_files_of_others(cls, path: str | pathlib.Path | io.BufferedIOBase) -> None:
+    def _saved_attributes(cls, path: str | pathlib.Path | io.BufferedIOBase) -> dict[str, Any]:
+        """What a file says of a model's attributes, as JSON; empty if it is no zip file.
+
+        :raises ValueError: if another algorithm wrote it
+        """
         file = open_path(path, "r", verbose=0, suffix="zip")
         attributes = json.loads(zipfile.ZipFile(file).read("data")) if zipfile.is_zipfile(file) else {}
         if file is path:
@@ -345,6 +354,7 @@ class OptionOffPolicyAlgorithm(OffPolicyAlgorithm):
             raise ValueError(
                 f"{path} was not saved by {cls.__name__}: its policy is from {writer}. Load it with the class that saved it"
             )
+        return attributes
 
     def _setup_model(self) -> None:
         if self.n_steps != 1:

@@ -16,6 +16,7 @@ from torch import nn
 from sb3_ctco.common.buffers import DictOptionReplayBuffer, OptionReplayBuffer
 from sb3_ctco.common.losses import ENTROPY_REFERENCES, EntropyReference, actor_loss, critic_target, log_reference_density
 from sb3_ctco.common.soft_actor_critic import SoftOptionActorCritic
+from sb3_ctco.ctco.canonical import CanonicalOptions
 from sb3_ctco.ctco.fast_update import FastUpdate
 from sb3_ctco.ctco.policies import CnnPolicy, CTCOPolicy, MlpPolicy, MultiInputPolicy, OptionActor, OptionCritic
 from sb3_ctco.options import DurationScale, Trajectory
@@ -40,7 +41,8 @@ class CTCO(SoftOptionActorCritic):
     Where it differs from the paper, the paper's way is an argument away: entropy counts relative to the uniform
     distribution (``entropy_reference="paper"``), two critics (``policy_kwargs=dict(n_critics=1)``), a temperature each
     for ω and d, learned (pass numbers; the same one twice is the paper's β_E), ω squashed by tanh so that actions stay
-    in their bounds, and a shortest duration of one step (the paper's durations are in (0, d_max)).
+    in their bounds, a shortest duration of one step (the paper's durations are in (0, d_max)), and critics that see what
+    short options play (``canonical_weights=False``).
 
     Settings that the paper's algorithm would have are in :meth:`paper_defaults`; the class's own were measured to learn
     faster on the paper's tasks.
@@ -84,6 +86,9 @@ class CTCO(SoftOptionActorCritic):
         one nat a dimension in all: explore first, then get precise; 0 keeps them
     :param duration_learning_rate: step size of d's head; ``learning_rate`` by default
     :param entropy_reference: ``"uniform"``, ``"average"`` or ``"paper"``, see :func:`log_reference_density`
+    :param canonical_weights: whether critics see, in the place of ω, weights that are the same for all options that play the
+        same actions, which makes a difference to options of fewer steps than ``n_rbf``, see
+        :class:`~sb3_ctco.ctco.canonical.CanonicalOptions`
     :param fast_updates: whether to compute gradients without autograd where that is known to give the same, see
         :mod:`sb3_ctco.ctco.fast_update`; ``fast_updates_refusal`` says why not where it is not
     :param action_noise: noise added to normalised options while exploring
@@ -100,6 +105,11 @@ class CTCO(SoftOptionActorCritic):
     """
 
     _own_setting: ClassVar[str] = "high_freq_penalty"
+
+    _before_it_was_saved: ClassVar[dict[str, Any]] = {
+        **SoftOptionActorCritic._before_it_was_saved,
+        "canonical_weights": False,
+    }
 
     policy_aliases: ClassVar[dict[str, type[BasePolicy]]] = {
         "MlpPolicy": MlpPolicy,
@@ -143,6 +153,7 @@ class CTCO(SoftOptionActorCritic):
         target_entropy_anneal: float = 0.0,
         duration_learning_rate: float | Schedule | None = None,
         entropy_reference: EntropyReference = "uniform",
+        canonical_weights: bool = True,
         fast_updates: bool = True,
         action_noise: ActionNoise | None = None,
         replay_buffer_class: type[ReplayBuffer] | None = None,
@@ -209,6 +220,7 @@ class CTCO(SoftOptionActorCritic):
         self.high_freq_penalty = high_freq_penalty
         self.target_decision_rate = target_decision_rate
         self.target_entropy_anneal = target_entropy_anneal
+        self.canonical_weights = canonical_weights
         self.fast_updates = fast_updates
         self.duration_learning_rate = duration_learning_rate
         self.entropy_reference: EntropyReference = entropy_reference
@@ -246,11 +258,17 @@ class CTCO(SoftOptionActorCritic):
             "trajectory": "rbf",
             "duration_scale": "linear",
             "entropy_reference": "paper",
+            "canonical_weights": False,
             "policy_kwargs": {"n_critics": 1, "net_arch": {"pi": [10, 10], "qf": [64, 64]}},
         }
 
     def _setup_model(self) -> None:
         super()._setup_model()
+        space = self.option_space
+        #: What makes options canonical for the critics; None where it makes no difference or is not wanted
+        self.canonical_options: CanonicalOptions | None = None
+        if self.canonical_weights and not CanonicalOptions.makes_no_difference(space):
+            self.canonical_options = CanonicalOptions(space, self.device)
         self._fast_update: FastUpdate | None = None
         #: Why updates were made with autograd in the last training; None if they were not
         self.fast_updates_refusal: str | None = None
@@ -306,7 +324,7 @@ class CTCO(SoftOptionActorCritic):
 
     def _critic_targets(self, data: ReplayBufferSamples) -> th.Tensor:
         next_options, next_log_prob = self.actor_target.option_log_prob(data.next_observations)
-        next_q_values = self.critic_target(data.next_observations, next_options)
+        next_q_values = self.critic_target(data.next_observations, self._as_critics_see(next_options))
         return self._targets(data, next_q_values, self.entropy_costs(next_log_prob))
 
     def _targets(self, data: ReplayBufferSamples, next_q_values: th.Tensor, next_entropy_costs: th.Tensor) -> th.Tensor:
@@ -328,7 +346,13 @@ class CTCO(SoftOptionActorCritic):
 
     def _actor_loss(self, obs: PyTorchObs, sample: tuple[th.Tensor, ...]) -> th.Tensor:
         options, log_prob = sample
-        return actor_loss(self.critic(obs, options), self.entropy_costs(log_prob))
+        return actor_loss(self.critic(obs, self._as_critics_see(options)), self.entropy_costs(log_prob))
+
+    def _q_values(self, data: ReplayBufferSamples) -> th.Tensor:
+        return self.critic(data.observations, self._as_critics_see(data.actions))
+
+    def _as_critics_see(self, options: th.Tensor) -> th.Tensor:
+        return options if self.canonical_options is None else self.canonical_options(options)
 
     def train(self, gradient_steps: int, batch_size: int = 64) -> None:
         """Sample the replay buffer and update temperatures, critics, actor and targets.
@@ -415,7 +439,14 @@ class CTCO(SoftOptionActorCritic):
         )
 
     def _excluded_save_params(self) -> list[str]:
-        derived = ["actor_target", "_log_reference", "_last_next_values", "_fast_update", "fast_updates_refusal"]
+        derived = [
+            "actor_target",
+            "canonical_options",
+            "_log_reference",
+            "_last_next_values",
+            "_fast_update",
+            "fast_updates_refusal",
+        ]
         return [*super()._excluded_save_params(), *derived]
 
     def _get_torch_save_params(self) -> tuple[list[str], list[str]]:

@@ -115,7 +115,7 @@ class FastUpdate:
             self._ent_coef_gradient.copy_(gradient)
             self._ent_coef_adam.step()
 
-        inputs = th.cat((features, th.stack((data.actions, options[1]))), dim=2)
+        inputs = th.cat((features, model._as_critics_see(th.stack((data.actions, options[1])))), dim=2)
         # Of the critics, and of their targets.
         q_values, next_q_values = self._critics.forward(
             inputs[:, None].expand(-1, n_critics, -1, -1).flatten(end_dim=1)
@@ -125,11 +125,13 @@ class FastUpdate:
         self._critic_adam.step()
         q_loss = critic_loss(q_values, targets)
 
-        inputs = th.cat((features[0], options[0]), dim=1)
+        inputs = th.cat((features[0], model._as_critics_see(options[0])), dim=1)
         q_values = self._critics.forward(inputs.expand(n_critics, -1, -1))
         q_min = q_values.amin(dim=0)
         pi_loss = (model.entropy_costs(log_prob[0]) - q_min).mean()
         option_gradient = self._critics.input_gradient((q_values == q_min) / -batch_size, first=features.shape[2])
+        if model.canonical_options is not None:
+            option_gradient = model.canonical_options.gradient(option_gradient, options[0])
         self._actors.backward(option_gradient, model.ent_coefs / batch_size)
         self._actor_adam.step()
 

@@ -96,7 +96,11 @@ class OptionSpace:
 
     def duration(self, option: FloatArray) -> float:
         """The duration d that an option vector asks for, in s: its last entry, mapped from [−1, 1] to [d_min, d_max]."""
-        fraction = 0.5 * (float(option[-1]) + 1.0)
+        return self.seconds(float(option[-1]))
+
+    def seconds(self, normalised: Any) -> Any:
+        """The duration in s that a number in [−1, 1] stands for, or an array or tensor of such."""
+        fraction = 0.5 * (normalised + 1.0)
         if self.duration_scale == "log":
             return self.d_min * (self.d_max / self.d_min) ** fraction
         return self.d_min + fraction * (self.d_max - self.d_min)

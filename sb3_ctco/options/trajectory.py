@@ -74,6 +74,15 @@ class Trajectory(ABC):
         fitted = np.einsum("tai,ti->ta", omega.repeat(lengths, axis=0), basis)
         return omega, np.maximum.reduceat(np.abs(fitted - actions), starts).max(axis=1)
 
+    def canonical(self) -> FloatArray:
+        """What turns the weights of options into weights that play the same actions, the same for all that do.
+
+        :return: shape ``[n_weights, n_weights, n_weights]``: the matrix at index k − 1 is for options of k steps (and the last
+            one, the identity, for longer ones): ``matrix @ ω`` for an action dimension's weights
+        """
+        matrices = [_basis_and_fit(self, k) for k in range(1, self.n_weights)]
+        return np.stack([*(table[:, 1].T @ table[:, 0] for table in matrices), np.eye(self.n_weights)])
+
 
 class RadialBasis(Trajectory):
     """Normalised radial basis functions φ(t/d), the paper's options, equation (4). One weight repeats one action.
