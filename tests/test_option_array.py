@@ -163,7 +163,7 @@ def test_eval_callback_evaluates_repeatably(random_walk_env):
 
 
 def test_eval_callback_refuses_what_it_cannot_wrap(random_walk_env):
-    model = CTCO("MlpPolicy", random_walk_env(), **SMALL)
+    model = CTCO("MlpPolicy", random_walk_env(), d_max=1.0, **SMALL)
     bare = VecNormalize(DummyVecEnv([random_walk_env]), norm_reward=False)
     with pytest.raises(ValueError, match=r"VecNormalize.*do not play options.*model\.wrap_env"):
         model.learn(20, callback=EvalCallback(bare))
