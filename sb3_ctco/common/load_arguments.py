@@ -2,6 +2,7 @@
 
 import inspect
 import io
+import math
 import pathlib
 from collections.abc import Collection
 from typing import Any
@@ -34,7 +35,7 @@ def check_load_arguments(
     if fixed:
         data, _, _ = load_from_zip_file(path, device="cpu")
         assert data is not None
-        differing = {name: arguments[name] for name in fixed if arguments[name] != data.get(name)}
+        differing = {name: arguments[name] for name in fixed if not _equal(arguments[name], data.get(name))}
         if differing:
             of_file = {name: data.get(name) for name in differing}
             raise ValueError(
@@ -42,3 +43,10 @@ def check_load_arguments(
                 f"out, or make a new model; these can be changed: {sorted(known - set(kept))}"
             )
     return {"_stats_window_size" if name == "stats_window_size" else name: value for name, value in arguments.items()}
+
+
+def _equal(one: Any, other: Any) -> bool:
+    # FiGAR-SAC's d_max is a number of steps times dt by the time it is saved.
+    if isinstance(one, int | float) and isinstance(other, int | float):
+        return math.isclose(one, other, rel_tol=1e-9)
+    return bool(one == other)
