@@ -53,7 +53,7 @@ def main() -> None:
     th.set_num_threads(1)
 
     policy = OptionController(args.model).policy
-    print(f"trained at {1 / policy.option_settings.dt:g} Hz")
+    print(f"trained at {1 / policy.option_space.dt:g} Hz")
     print("| control rate, Hz | discounted return | rewarded | decisions a second |\n|---|---|---|---|")
     for rate in RATES:
         env = gym.make(args.env, dt=1 / rate, time_limit=SECONDS)

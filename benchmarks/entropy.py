@@ -12,7 +12,7 @@ import matplotlib as mpl
 import matplotlib.pyplot as plt
 import numpy as np
 
-LABELS = {"uniform": "relative to uniform (default)", "paper": "log π, the paper's", "duration": "paid as a rate"}
+LABELS = {"uniform": "relative to uniform (default)", "paper": "log π, the paper's"}
 #: Episodes that a point averages
 WINDOW = 10
 

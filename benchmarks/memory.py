@@ -10,7 +10,7 @@ import numpy as np
 from gymnasium import spaces
 
 from sb3_ctco import DictOptionReplayBuffer, OptionReplayBuffer
-from sb3_ctco.wrappers import SubOptions
+from sb3_ctco.options import SubOptions
 
 IMAGE = spaces.Dict({"image": spaces.Box(0, 255, (3, 60, 80), np.uint8), "proprioception": spaces.Box(-10, 10, (21,))})
 SPACES = {

@@ -3,7 +3,7 @@
     python benchmarks/updates.py
 
 Both train on a full replay buffer of ball in cup, one thread, taking turns; the ratio is the median over the repeats.
-"with autograd" is CTCO as it trains networks that sb3_ctco/ctco/gradients.py does not know.
+"with autograd" is CTCO as it trains networks that sb3_ctco/ctco/fast_update.py does not know.
 """
 
 import argparse
@@ -28,8 +28,7 @@ SIZES: dict[str, tuple[dict[str, list[int]], int]] = {
 
 
 class AutogradCTCO(CTCO):
-    def _prepare_hand_gradients(self) -> None:
-        self._hand_gradients = None
+    """A subclass, which is updated with autograd."""
 
 
 def make(algorithm: type[OffPolicyAlgorithm], net_arch: dict[str, list[int]], batch_size: int) -> OffPolicyAlgorithm:

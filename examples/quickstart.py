@@ -1,7 +1,7 @@
 """Train CTCO on a MuJoCo task at a high interaction frequency, and look at what it does.
 
 By default: the sparse point mass at 500 Hz. A mass must be pushed to a small target; the reward is 1 a second on the
-target and nothing anywhere else. About two and a half minutes.
+target and nothing anywhere else. README.md says how long it takes.
 
     python examples/quickstart.py
     python examples/quickstart.py --task ball_in_cup --dt 0.02 --seconds 2400 --seed 1 --output runs/cup
@@ -124,7 +124,7 @@ def draw_learning_curve(curve: DiscountedReturnCallback, dt: float, random: floa
 
 def draw_episode(model: CTCO, env: OptionExecutionWrapper, seed: int, path: Path) -> None:
     """Play one greedy episode primitive step by primitive step, and draw its actions, decisions and rewards."""
-    bare, dt = env.env, env.option_settings.dt
+    bare, dt = env.env, env.option_space.dt
     obs, _ = bare.reset(seed=seed)
     actions: list[np.ndarray] = []
     rewards: list[float] = []

@@ -2,23 +2,27 @@
 
     python examples/watch.py model.zip --env Pendulum-v1
     MUJOCO_GL=egl python examples/watch.py model.zip --env sb3_ctco/ball_in_cup-catch-v0 --rate 50
+    MUJOCO_GL=egl python examples/watch.py model.zip --env sb3_ctco/point_mass-easy-v0 --rate 500 --env-kwargs sparse:True
 
-Needs matplotlib, and moviepy for the video. Writes episode.png and episode-episode-0.mp4 into --folder. The model is one
-that CTCO saved, or an exported .onnx; it drives the bare environment, which --rate makes with another dt if the
-environment takes one.
+Needs pip install '.[render]' in the clone, and for MuJoCo without a display MUJOCO_GL=egl or osmesa. Writes episode.png
+and episode-0.mp4 into --folder. The model is one that CTCO saved, or an exported .onnx; it drives the bare environment,
+which --rate makes with another dt if the environment takes one. The video has --fps frames per second of task time,
+whatever the rate.
 """
 
 import argparse
+import ast
 import warnings
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
 import gymnasium as gym
 import matplotlib as mpl
 import numpy as np
-from gymnasium.wrappers import RecordVideo
 
 from sb3_ctco import OptionController
+from sb3_ctco.video import RecordEpisodes
 from sb3_ctco.wrappers import find_dt
 
 mpl.use("Agg")
@@ -91,11 +95,24 @@ def plot(trace: Trace, title: str, path: Path) -> None:
     plt.close(figure)
 
 
+def key_and_value(text: str) -> tuple[str, Any]:
+    """RL Zoo's ``key:value``, a Python literal or a string."""
+    key, colon, value = text.partition(":")
+    if not colon:
+        raise argparse.ArgumentTypeError(f"{text!r} is not key:value, such as sparse:True")
+    try:
+        return key, ast.literal_eval(value)
+    except (SyntaxError, ValueError):
+        return key, value
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("model", help="saved by CTCO (.zip), or exported (.onnx)")
     parser.add_argument("--env", required=True, help="Gymnasium id of the bare environment")
     parser.add_argument("--rate", type=float, help="control rate in Hz, for environments that take dt")
+    parser.add_argument("--env-kwargs", nargs="+", type=key_and_value, default=[], help="key:value, as in RL Zoo")
+    parser.add_argument("--fps", type=float, default=25.0, help="of the video")
     parser.add_argument("--vec-normalize", help="statistics that VecNormalize saved, if training normalised observations")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--folder", default="watch")
@@ -104,12 +121,11 @@ def main() -> None:
     warnings.filterwarnings("ignore", message=".*GLFW.*")
 
     folder = Path(args.folder)
-    kwargs = {"dt": 1 / args.rate} if args.rate else {}
+    kwargs = {**dict(args.env_kwargs), **({"dt": 1 / args.rate} if args.rate else {})}
     env = gym.make(args.env, render_mode=None if args.no_video else "rgb_array", **kwargs)
     dt = find_dt(env)
     if not args.no_video:
-        fps = round(1 / dt) if dt else None
-        env = RecordVideo(env, str(folder), name_prefix="episode", fps=fps, disable_logger=True)
+        env = RecordEpisodes(env, folder, args.fps, progress=True)
     controller = OptionController(args.model, dt=dt, vec_normalize=args.vec_normalize)
     trace = play(controller, env, args.seed)
     env.close()

@@ -5,7 +5,7 @@ import math
 import pickle
 import zipfile
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass, fields, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Protocol
 
@@ -13,7 +13,7 @@ import numpy as np
 import numpy.typing as npt
 from gymnasium import spaces
 
-from sb3_ctco.options import ActionBox, OptionSettings, action_plan, basis
+from sb3_ctco.options import ActionBox, OptionSpace
 
 if TYPE_CHECKING:
     from stable_baselines3.common.vec_env import VecNormalize
@@ -29,7 +29,7 @@ METADATA_KEY = "sb3_ctco"
 class OptionPolicy(Protocol):
     """What :class:`OptionController` needs of a policy: a function from observations to options, and their meaning."""
 
-    option_settings: OptionSettings
+    option_space: OptionSpace
     primitive_action_space: spaces.Box
 
     def __call__(self, observation: Observation) -> np.ndarray:
@@ -63,7 +63,7 @@ class ModelPolicy:
                 f"this {type(model).__name__} never had an environment, so the bounds of its actions are not known: "
                 "call set_env(env) before, and save the model after that"
             )
-        self.option_settings = model.option_settings
+        self.option_space = model.option_space
         self.primitive_action_space = model.primitive_action_space
         self.deterministic = deterministic
         self.vec_normalize = model.get_vec_normalize_env() if vec_normalize is None else vec_normalize
@@ -73,7 +73,7 @@ class ModelPolicy:
         """Options for one or several observations."""
         if self.vec_normalize is not None:
             observation = self.vec_normalize.normalize_obs(observation)
-        return self.model.predict(observation, deterministic=self.deterministic)[0]
+        return np.asarray(self.model.predict(observation, deterministic=self.deterministic)[0])
 
 
 class OnnxPolicy:
@@ -95,7 +95,9 @@ class OnnxPolicy:
         try:
             import onnxruntime  # noqa: PLC0415
         except ImportError as error:
-            raise ImportError("running an exported policy needs onnxruntime: pip install 'sb3-ctco[onnx]'") from error
+            raise ImportError(
+                "running an exported policy needs onnxruntime: in a clone of sb3-ctco, run pip install '.[onnx]'"
+            ) from error
         options = onnxruntime.SessionOptions()
         options.intra_op_num_threads = n_threads
         try:
@@ -106,8 +108,8 @@ class OnnxPolicy:
         if METADATA_KEY not in metadata:
             raise ValueError(f"{path} does not tell what its options mean: write it with sb3_ctco.export.export_onnx")
         try:
-            self.option_settings, self.primitive_action_space, self._observations = _from_metadata(metadata[METADATA_KEY])
-            _check_graph(self._session, self.option_settings, self.primitive_action_space, self._observations)
+            self.option_space, self.primitive_action_space, self._observations = _from_metadata(metadata[METADATA_KEY])
+            _check_graph(self._session, self.option_space, self.primitive_action_space, self._observations)
         except (AttributeError, KeyError, TypeError, ValueError, RecursionError) as error:
             raise ValueError(
                 f"the metadata of {path} are not those of an exported policy ({type(error).__name__}: {error}): write it anew "
@@ -131,16 +133,14 @@ class OnnxPolicy:
         return options if several else options[0]
 
 
-def to_metadata(
-    settings: OptionSettings, action_space: spaces.Box, observations: dict[str, tuple[tuple[int, ...], str]]
-) -> str:
+def to_metadata(settings: OptionSpace, action_space: spaces.Box, observations: dict[str, tuple[tuple[int, ...], str]]) -> str:
     """What an exported policy's options mean, as a line of JSON.
 
     :param observations: shape and dtype of each observation, by the name of the file's input
     """
     return json.dumps(
         {
-            "option_settings": asdict(settings),
+            "option_space": settings.arguments,
             "action_low": action_space.low.tolist(),
             "action_high": action_space.high.tolist(),
             "action_dtype": str(action_space.dtype),
@@ -148,6 +148,18 @@ def to_metadata(
         }
     )
 
+
+#: What an exported file says of its options, and of which types
+_SETTINGS: dict[str, tuple[type, ...]] = {
+    "n_rbf": (int,),
+    "trajectory": (str,),
+    "d_max": (int, float),
+    "d_min": (int, float),
+    "dt": (int, float),
+    "discount_rate": (int, float),
+    "duration_scale": (str,),
+}
+_OF_0_1_0 = {"trajectory": "rbf", "duration_scale": "linear"}
 
 #: Name of a dtype of numbers, as numpy has it, and what ONNX calls it
 _ONNX_TYPES = {
@@ -159,16 +171,19 @@ _ONNX_TYPES = {
 }
 
 
-def _from_metadata(text: str) -> tuple[OptionSettings, spaces.Box, dict[str, tuple[tuple[int, ...], str]]]:
+def _from_metadata(text: str) -> tuple[OptionSpace, spaces.Box, dict[str, tuple[tuple[int, ...], str]]]:
     """The inverse of :func:`to_metadata`, for a text that anybody may have written.
 
     :raises ValueError: if a value is out of its range, or malformed; likewise KeyError and TypeError
     """
     data = json.loads(text)
-    settings = data["option_settings"]
-    names = [field.name for field in fields(OptionSettings)]
-    if sorted(settings) != sorted(names) or not all(type(value) in (int, float) for value in settings.values()):
-        raise ValueError(f"option_settings must be the numbers {names}, not {settings}")
+    # Files that 0.1.0 wrote have it under another name, and no trajectory and scale, which were these.
+    settings = data["option_space"] if "option_space" in data else {**data["option_settings"], **_OF_0_1_0}
+    if not isinstance(settings, dict) or settings.keys() != _SETTINGS.keys():
+        raise ValueError(f"option_space must have {list(_SETTINGS)}, not {settings}")
+    for name, value in settings.items():
+        if type(value) not in _SETTINGS[name]:
+            raise ValueError(f"option_space has {name}={value!r}, which must be of {_SETTINGS[name]}")
     if data["action_dtype"] not in ("float16", "float32", "float64"):
         raise ValueError(f"action_dtype must be of floating point, not {data['action_dtype']!r}")
     dtype = np.dtype(data["action_dtype"])
@@ -182,11 +197,11 @@ def _from_metadata(text: str) -> tuple[OptionSettings, spaces.Box, dict[str, tup
         if kind not in _ONNX_TYPES or not all(type(n) is int and n > 0 for n in shape):
             raise ValueError(f"observation {name} must have sizes and a dtype of numbers, not {shape} and {kind!r}")
         observations[name] = (tuple(shape), kind)
-    return OptionSettings(**settings), spaces.Box(low, high, dtype=dtype.type), observations
+    return OptionSpace.make(**settings), spaces.Box(low, high, dtype=dtype.type), observations
 
 
 def _check_graph(
-    session: Any, settings: OptionSettings, action_space: spaces.Box, observations: dict[str, tuple[tuple[int, ...], str]]
+    session: Any, settings: OptionSpace, action_space: spaces.Box, observations: dict[str, tuple[tuple[int, ...], str]]
 ) -> None:
     """Refuse metadata that do not fit the graph they came with.
 
@@ -197,7 +212,7 @@ def _check_graph(
     if inputs != expected:
         raise ValueError(f"the graph's inputs are {inputs}, the metadata's {expected}")
     outputs = [(entry.type, *entry.shape[1:]) for entry in session.get_outputs()]
-    option_dim = action_space.low.size * settings.n_rbf + 1
+    option_dim = action_space.low.size * settings.trajectory.n_weights + 1
     if outputs != [("tensor(float)", option_dim)]:
         raise ValueError(f"the graph's outputs are {outputs}, and options of these settings have {option_dim} numbers")
 
@@ -265,7 +280,7 @@ class OptionController:
         vec_normalize: "VecNormalize | str | Path | None" = None,
     ):
         self.policy = _as_policy(policy, deterministic, vec_normalize)
-        trained = self.policy.option_settings
+        trained = self.policy.option_space
         #: What options mean here: training's settings, at this controller's ``dt``.
         self.settings = trained if dt is None else replace(trained, dt=dt)
         self._box = ActionBox(self.policy.primitive_action_space.low, self.policy.primitive_action_space.high)
@@ -333,7 +348,7 @@ class OptionController:
         self._now = now
         # A late tick may find the phase past its end, where the option holds its last action.
         phases = np.array([min((now - e.start) / (e.n_steps * dt), 1.0) for e in self._executions])
-        features = basis(phases, self.settings.n_rbf)
+        features = self.settings.trajectory.basis(phases)
         actions = self._box.cast(np.array([row.dot(e.weights) for row, e in zip(features, self._executions, strict=True)]))
         return actions if self._several else actions[0]
 
@@ -355,7 +370,7 @@ class OptionController:
         # As OptionExecutionWrapper does, in the same precision.
         option = np.clip(option.astype(np.float64), -1.0, 1.0)
         omega, n_steps = self.settings.decode(option)
-        plan = self._box.actions(action_plan(omega, n_steps))
+        plan = self._box.actions(self.settings.trajectory.plan(omega, n_steps))
         # Features sum to one, so that actions are the same combination of weights in their own units.
         return _Execution(option, n_steps, plan, self._box.scale(omega.T), start=now)
 

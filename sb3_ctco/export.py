@@ -80,7 +80,9 @@ def export_onnx(
     try:
         import onnx  # noqa: PLC0415
     except ImportError as error:
-        raise ImportError("exporting a policy needs onnx and onnxscript: pip install 'sb3-ctco[onnx]'") from error
+        raise ImportError(
+            "exporting a policy needs onnx and onnxscript: in a clone of sb3-ctco, run pip install '.[onnx]'"
+        ) from error
 
     policy = ModelPolicy(model, vec_normalize=vec_normalize)
     space = model.observation_space
@@ -112,7 +114,7 @@ def export_onnx(
 
     file = onnx.load(path)
     entry = file.metadata_props.add()
-    entry.key, entry.value = METADATA_KEY, to_metadata(policy.option_settings, policy.primitive_action_space, observations)
+    entry.key, entry.value = METADATA_KEY, to_metadata(policy.option_space, policy.primitive_action_space, observations)
     onnx.save(file, path)
 
 

@@ -26,7 +26,10 @@ try:
     from rl_zoo3.hyperparams_opt import HYPERPARAMS_CONVERTER, HYPERPARAMS_SAMPLER
     from rl_zoo3.utils import ALGOS, get_wrapper_class
 except ImportError as error:  # pragma: no cover
-    raise ImportError("training through RL Zoo needs rl_zoo3: pip install 'sb3-ctco[zoo]'") from error
+    missing = (error.name or "rl_zoo3").partition(".")[0]
+    raise ImportError(
+        f"RL Zoo is needed, and {missing} is missing: in a clone of sb3-ctco, run pip install '.[zoo]'"
+    ) from error
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.vec_env import VecEnv
 
@@ -34,7 +37,6 @@ from sb3_ctco.common.option_algorithm import OptionOffPolicyAlgorithm
 from sb3_ctco.ctco import CTCO
 from sb3_ctco.dac_ppo import DACPPO
 from sb3_ctco.figar_sac import FiGARSAC
-from sb3_ctco.study.cli import main as study
 
 #: The package's algorithms by their names in the Zoo.
 ALGORITHMS: dict[str, type[BaseAlgorithm]] = {"ctco": CTCO, "dac_ppo": DACPPO, "figar_sac": FiGARSAC}
@@ -167,36 +169,19 @@ def with_defaults(command: str, arguments: Sequence[str]) -> list[str]:
     return [*defaults, *arguments]
 
 
-COMMANDS = {
-    "train": "train an agent",
-    "enjoy": "watch an agent that was trained",
-    "tune": "search hyperparameters with Optuna (train --optimize-hyperparameters)",
-    "study": "the frequency study; its flags are its own, see sb3-ctco study --help",
-}
+def main(arguments: Sequence[str]) -> None:
+    """RL Zoo's part of the command ``sb3-ctco``.
 
-
-def main(arguments: Sequence[str] | None = None) -> None:
-    """The command ``sb3-ctco``.
-
-    :param arguments: the command and RL Zoo's flags; those of the process by default
+    :param arguments: ``"train"``, ``"tune"`` or ``"enjoy"``, then RL Zoo's flags
     """
-    parser = argparse.ArgumentParser(
-        prog="sb3-ctco",
-        description="RL Zoo with CTCO. Commands take RL Zoo's flags; sb3-ctco COMMAND --help lists them.",
-        epilog="\n".join(f"{name:7} {text}" for name, text in COMMANDS.items()),
-        formatter_class=argparse.RawDescriptionHelpFormatter,
-    )
-    parser.add_argument("command", choices=COMMANDS)
-    parser.add_argument("flags", nargs=argparse.REMAINDER, help="RL Zoo's flags; --algo is ctco by default")
-    args = parser.parse_args(arguments)
-    if args.command == "study":
-        sys.exit(study(args.flags))
-
+    command, *flags = arguments
     argv, manager = sys.argv, rl_zoo3.train.ExperimentManager
-    sys.argv = [f"sb3-ctco {args.command}", *with_defaults(args.command, args.flags)]
+    sys.argv = [f"sb3-ctco {command}", *with_defaults(command, flags)]
     rl_zoo3.train.ExperimentManager = OptionExperimentManager  # type: ignore[misc]
+    if command == "enjoy":
+        print("With an algorithm of options, a timestep of -n and of Episode Length is a decision, not an environment step.")
     try:
-        (rl_zoo3.enjoy.enjoy if args.command == "enjoy" else rl_zoo3.train.train)()
+        (rl_zoo3.enjoy.enjoy if command == "enjoy" else rl_zoo3.train.train)()
     finally:
         sys.argv, rl_zoo3.train.ExperimentManager = argv, manager  # type: ignore[misc]
 

@@ -14,6 +14,10 @@ from gymnasium import spaces
 th.set_num_threads(1)
 os.environ.setdefault("OMP_NUM_THREADS", "1")
 
+#: How long tests wait for other processes, in s: not how fast these should be, but the end of a hang, however loaded the
+#: machine is
+PATIENCE = float(os.environ.get("TEST_PATIENCE", "900"))
+
 
 class ScriptedEnv(gym.Env[np.ndarray, np.ndarray]):
     """Observes how many steps were made and the last action; pays ``rewards(step, action)``; ends where told.

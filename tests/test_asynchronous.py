@@ -18,6 +18,7 @@ import gymnasium as gym
 import numpy as np
 import pytest
 import torch as th
+from conftest import PATIENCE
 from gymnasium import spaces
 from gymnasium.error import ResetNeeded
 from stable_baselines3 import PPO, SAC
@@ -427,7 +428,7 @@ def test_ctrl_c_stops_both_within_a_second_and_saves(tmp_path, signum):
         os.killpg(process.pid, signum)
     else:
         process.send_signal(signum)
-    rest, _ = process.communicate(timeout=30)
+    rest, _ = process.communicate(timeout=PATIENCE)
     name, command, when = rest.strip().splitlines()[-1].split()
     assert name == {signal.SIGINT: "KeyboardInterrupt", signal.SIGTERM: "SystemExit"}[signum]
     assert float(command) == 0.0

@@ -15,17 +15,17 @@ from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 from sb3_ctco import CTCO, DACPPO, FiGARSAC, OptionController, OptionExecutionWrapper
 from sb3_ctco.controller import OnnxPolicy
 from sb3_ctco.export import export_onnx
-from sb3_ctco.options import OptionSettings
+from sb3_ctco.options import OptionSpace
 
 DT = 0.1
-SETTINGS = OptionSettings(n_rbf=1, d_max=0.4, d_min=DT, dt=DT, discount_rate=0.4)
+SETTINGS = OptionSpace.make(n_rbf=1, d_max=0.4, d_min=DT, dt=DT, discount_rate=0.4)
 SPACE = spaces.Box(np.array([-2.0, 0.0], np.float32), np.array([2.0, 10.0], np.float32))
 
 
 class ScriptedPolicy:
     """Options from a list, in turn; several observations get the same one. Durations in s, for SETTINGS."""
 
-    option_settings = SETTINGS
+    option_space = SETTINGS
     primitive_action_space = SPACE
 
     def __init__(self, *script: tuple[float, float, float]):
@@ -153,7 +153,7 @@ def test_irregular_ticks():
 
 def test_a_late_tick_holds_the_last_action_of_the_option():
     class Ramp(ScriptedPolicy):
-        option_settings = OptionSettings(n_rbf=2, d_max=0.4, d_min=0.4, dt=DT, discount_rate=0.4)
+        option_space = OptionSpace.make(n_rbf=2, d_max=0.4, d_min=0.4, dt=DT, discount_rate=0.4)
         primitive_action_space = spaces.Box(-1.0, 1.0, (1,))
 
         def __call__(self, observation):
@@ -270,12 +270,12 @@ def test_exported_policy_is_the_policy(tmp_path, pendulum_model):
     path = tmp_path / "model.onnx"
     export_onnx(pendulum_model, path)
     policy = OnnxPolicy(path)
-    assert policy.option_settings == pendulum_model.option_settings
+    assert policy.option_space == pendulum_model.option_space
     assert policy.primitive_action_space == pendulum_model.primitive_action_space
     observations = np.random.default_rng(0).normal(size=(100, 3)).astype(np.float32)
     expected = pendulum_model.predict(observations, deterministic=True)[0]
     np.testing.assert_allclose(policy(observations), expected, atol=1e-5)
-    np.testing.assert_allclose(policy(observations[0]), expected[0], atol=1e-5)
+    np.testing.assert_allclose(policy(observations[0]), expected[0].vector, atol=1e-5)
 
 
 @pytest.mark.parametrize("kind", ["dict", "image"])
@@ -424,14 +424,14 @@ def with_metadata(source, target, change):
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        (lambda data: data["option_settings"].update(n_rbf=10**9), "the graph's outputs are"),
-        (lambda data: data["option_settings"].update(n_rbf=2), "the graph's outputs are .* have 3 numbers"),
-        (lambda data: data["option_settings"].update(n_rbf="3"), "option_settings must be the numbers"),
-        (lambda data: data["option_settings"].update(dt=float("nan")), "dt must be a positive number"),
-        (lambda data: data["option_settings"].update(d_max=True), "option_settings must be the numbers"),
-        (lambda data: data["option_settings"].update(other=1.0), "option_settings must be the numbers"),
-        (lambda data: data["option_settings"].pop("dt"), "option_settings must be the numbers"),
-        (lambda data: data.update(option_settings=[1]), "option_settings must be the numbers"),
+        (lambda data: data["option_space"].update(n_rbf=10**9), "the graph's outputs are"),
+        (lambda data: data["option_space"].update(n_rbf=2), "the graph's outputs are .* have 3 numbers"),
+        (lambda data: data["option_space"].update(n_rbf="3"), "option_space"),
+        (lambda data: data["option_space"].update(dt=float("nan")), "dt must be a positive number"),
+        (lambda data: data["option_space"].update(d_max=True), "option_space"),
+        (lambda data: data["option_space"].update(other=1.0), "option_space"),
+        (lambda data: data["option_space"].pop("dt"), "option_space"),
+        (lambda data: data.update(option_space=[1]), "option_space"),
         (lambda data: data.update(observations=[1]), "AttributeError"),
         (lambda data: data.update(action_dtype="O"), "action_dtype must be of floating point, not 'O'"),
         (lambda data: data.update(action_low=[float("-inf")]), "must be finite and of one shape"),

@@ -5,6 +5,7 @@ import numpy as np
 import pytest
 import torch as th
 from gymnasium import spaces
+from stable_baselines3 import SAC
 from stable_baselines3.common.buffers import ReplayBuffer
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.noise import NormalActionNoise
@@ -12,7 +13,7 @@ from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecNorm
 from torch.distributions import Normal
 
 from sb3_ctco import CTCO, DictOptionReplayBuffer, OptionExecutionWrapper, OptionReplayBuffer
-from sb3_ctco.ctco.ctco import actor_loss, critic_loss, critic_target, duration_weight, log_reference_density
+from sb3_ctco.common.losses import actor_loss, critic_loss, critic_target, log_reference_density
 from sb3_ctco.ctco.policies import CTCOPolicy, EnsembleLinear, squashed_log_prob
 from sb3_ctco.options import DEFAULT_DISCOUNT_RATE, step_weight
 
@@ -57,7 +58,7 @@ def test_the_policy_gradient_runs_through_omega_and_d():
     matrix = th.randn(4, 4, dtype=th.float64)
     noise = th.randn(16, 3, dtype=th.float64)
     parameters = th.randn(6, dtype=th.float64).requires_grad_(True)
-    reference = log_reference_density(2, 0.1, 1.0, "uniform").double()
+    reference = log_reference_density(2, 0.1, 1.0, "uniform", th.zeros(1, 2)).double()
     coefficients = th.tensor([0.3, 0.7], dtype=th.float64)
     scale = th.tensor([1.0, 1.0, 0.5], dtype=th.float64)
 
@@ -102,39 +103,161 @@ def test_densities_against_a_change_of_variables():
 
 
 def test_entropy_references():
+    log_prob = th.tensor([[5.0, 1.0], [7.0, 3.0]])
     # Uniform over [−1, 1]^6 and over [−1, 1]
-    th.testing.assert_close(log_reference_density(6, 0.1, 1.0, "uniform"), th.tensor([-6 * math.log(2.0), -math.log(2.0)]))
+    uniform = log_reference_density(6, 0.1, 1.0, "uniform", log_prob)
+    th.testing.assert_close(uniform, th.tensor([-6 * math.log(2.0), -math.log(2.0)]))
+    th.testing.assert_close(log_reference_density(6, 0.1, 1.0, "average", log_prob), th.tensor([6.0, 2.0]))
     # The unit density over ω and over d in s: [0.1, 2.1] s is as long as [−1, 1].
-    th.testing.assert_close(log_reference_density(6, 0.1, 2.1, "paper"), th.zeros(2))
-    th.testing.assert_close(log_reference_density(6, 0.1, 0.6, "paper"), th.tensor([0.0, math.log(0.25)]))
+    th.testing.assert_close(log_reference_density(6, 0.1, 2.1, "paper", log_prob), th.zeros(2))
+    th.testing.assert_close(log_reference_density(6, 0.1, 0.6, "paper", log_prob), th.tensor([0.0, math.log(0.25)]))
+
+
+def test_relative_to_the_average_a_decision_costs_nothing():
+    model = make(random_walk_like(), ent_coef=1.0, duration_ent_coef=0.5, entropy_reference="average")
+    # 5 and 7 are 1 off their mean, 1 and 3 likewise at half the temperature.
+    costs = model.entropy_costs(th.tensor([[5.0, 1.0], [7.0, 3.0]]))
+    th.testing.assert_close(costs, th.tensor([[-1.5], [1.5]]))
+
+
+@pytest.mark.slow
+def test_the_price_of_a_decision_is_the_penalty_alone(scripted_env):
+    """Where nothing is ever paid, long and short options are worth the same: without a penalty no duration is preferred.
+
+    The mean duration then is the one of most entropy, in the middle of 0.1 to 2 s.
+    """
+
+    def mean_duration(seed, **kwargs):
+        env = scripted_env(rewards=lambda step, action: 0.0, dt=0.1, truncate_at=50)
+        small = {"n_rbf": 1, "d_max": 2.0, "batch_size": 64, "policy_kwargs": {"net_arch": [32, 32]}, "learning_rate": 1e-3}
+        timing = {"gamma": 0.9, "gamma_dt": 0.1, "updates_per_second": 5, "learning_starts": 500}
+        temperatures = {"ent_coef": 0.1, "duration_ent_coef": 0.1}
+        model = make(env, **{**small, **timing, **temperatures, "seed": seed, **kwargs}).learn(6000)
+        obs = th.tensor([[count, 0.0] for count in range(0, 50, 5)]).repeat(200, 1)
+        with th.no_grad():
+            options, _ = model.actor.option_log_prob(obs)
+        return 0.1 + 0.5 * (options[:, -1].mean().item() + 1.0) * 1.9
+
+    free = [mean_duration(seed, high_freq_penalty=0.0, entropy_reference="average") for seed in range(3)]
+    np.testing.assert_allclose(free, 1.05, atol=0.1)
+    # A penalty lengthens options, and being paid for entropy shortens them.
+    assert mean_duration(0, high_freq_penalty=0.2, entropy_reference="average") > max(free) + 0.1
+    assert mean_duration(0, high_freq_penalty=0.0, entropy_reference="paper") < min(free) - 0.1
 
 
 def test_a_decision_is_never_paid_for_its_entropy():
     """Relative to the uniform distribution the expected cost is a KL divergence, at least 0."""
     model = make(random_walk_like(), ent_coef=1.0, duration_ent_coef=1.0)
-    options, log_prob = model.actor.option_log_prob(th.zeros(4096, 2))
-    assert model.entropy_costs(options, log_prob).mean() > -0.05
+    _, log_prob = model.actor.option_log_prob(th.zeros(4096, 2))
+    assert model.entropy_costs(log_prob).mean() > -0.05
     # With the paper's density the same policy is paid at each decision.
     model = make(random_walk_like(), ent_coef=1.0, duration_ent_coef=1.0, entropy_reference="paper")
-    assert model.entropy_costs(options, log_prob).mean() < -0.5
+    assert model.entropy_costs(log_prob).mean() < -0.5
 
 
-def test_entropy_paid_as_a_rate():
-    """An entropy cost of 1/s for d seconds is worth (1 − e^(−τd))/τ, whatever the number of decisions it takes."""
-    # Options of 0.1, 0.55 and 1 s, without discounting and at 1 /s
-    durations = th.tensor([-1.0, 0.0, 1.0])
-    th.testing.assert_close(duration_weight(durations, 0.1, 1.0, 0.0), th.tensor([0.1, 0.55, 1.0]))
-    expected = th.tensor([1 - math.exp(-0.1), 1 - math.exp(-0.55), 1 - math.exp(-1.0)])
-    th.testing.assert_close(duration_weight(durations, 0.1, 1.0, 1.0), expected)
-    # Two options of 0.5 s cost what one of 1 s does.
-    half, whole = duration_weight(th.tensor([-0.5, 0.5]), 0.25, 1.25, 0.404)
-    assert half.item() + math.exp(-0.404 * 0.5) * half.item() == pytest.approx(whole.item(), rel=1e-6)
+def test_paper_entropies_need_the_papers_durations():
+    with pytest.raises(ValueError, match=r"entropy_reference='paper' .* needs duration_scale='linear', not 'log'"):
+        make(random_walk_like(), entropy_reference="paper", duration_scale="log")
 
-    by_decision = make(random_walk_like(), ent_coef=1.0, duration_ent_coef=0.5)
-    by_time = make(random_walk_like(), ent_coef=1.0, duration_ent_coef=0.5, entropy_reference="duration")
-    options, log_prob = by_time.actor.option_log_prob(th.zeros(8, 2))
-    weights = duration_weight(options[:, -1:], 0.1, 1.0, by_time.discount_rate)
-    th.testing.assert_close(by_time.entropy_costs(options, log_prob), weights * by_decision.entropy_costs(options, log_prob))
+
+def test_the_critics_see_what_is_played(random_walk_env):
+    """Of one step the first of two weights is all: options that differ in the other have one value, and no gradient by it."""
+    model = make(random_walk_env(), n_rbf=2, d_max=0.5, trajectory="bezier").learn(40)
+    obs = th.zeros(2, 2)
+    options = th.tensor([[0.3, 0.9, -1.0], [0.3, -0.4, -1.0]], requires_grad=True)  # of one step
+    values = model.critic(obs, model._as_critics_see(options))
+    th.testing.assert_close(values[:, 0], values[:, 1])
+    (gradient,) = th.autograd.grad(values.sum(), options)
+    assert (gradient[:, 1] == 0).all() and (gradient[:, 0] != 0).all()
+    longer = th.tensor([[0.3, 0.9, 1.0]])
+    th.testing.assert_close(model._as_critics_see(longer), longer)
+    # Where the shortest option has two steps, there is nothing to do.
+    assert make(random_walk_env(), n_rbf=2, d_min=0.2).canonical_options is None
+    assert make(random_walk_env(), n_rbf=2, canonical_weights=False).canonical_options is None
+
+
+def test_what_a_decision_costs_is_logged(random_walk_env):
+    model = make(random_walk_env(), high_freq_penalty=0.25).learn(40)
+    model.train(1, 8)
+    logged = model.logger.name_to_value
+    next_q_values, costs = model._last_next_values
+    assert logged["option/high_freq_penalty"] == 0.25
+    assert logged["option/entropy_price"] == pytest.approx(costs.mean().item())
+    # Of two critics
+    assert logged["option/critic_spread"] == pytest.approx((next_q_values[0] - next_q_values[1]).abs().mean().item())
+
+
+def test_the_unit_of_rewards(random_walk_env):
+    """``"gamma_dt"`` is 1/∫₀^γ_dt e^(−τκ) dκ: an option of one gamma_dt with a reward of 3 all the time is worth 3."""
+    model = make(random_walk_env(), gamma=0.9, gamma_dt=0.1, reward_scale="gamma_dt", n_rbf=1, d_max=0.1)
+    assert model.replay_buffer.reward_scale == pytest.approx(1 / step_weight(0.1, model.discount_rate))
+    model.learn(30)
+    buffer = model.replay_buffer
+    samples = buffer._get_samples(np.arange(10))
+    np.testing.assert_allclose(samples.rewards[:, 0], buffer.rewards[:10, 0], rtol=1e-5)  # one step an option
+    np.testing.assert_allclose(buffer.integrated_rewards[:10, 0] * buffer.reward_scale, samples.rewards[:, 0], rtol=1e-6)
+    for scale in (0.0, -1.0, math.inf, "auto"):
+        with pytest.raises(ValueError, match="reward_scale must be a positive number or 'gamma_dt'"):
+            make(random_walk_env(), reward_scale=scale)
+
+
+def test_a_loaded_buffer_has_the_algorithms_unit_and_discount(tmp_path, random_walk_env):
+    make(random_walk_env()).learn(30).save_replay_buffer(tmp_path / "buffer")
+    model = make(random_walk_env(), reward_scale=7.0)
+    model.load_replay_buffer(tmp_path / "buffer")
+    assert model.replay_buffer.reward_scale == 7.0
+    with pytest.raises(ValueError, match=r"discount_rate=0.40.*discount_rate=0.20.*the same gamma and gamma_dt"):
+        make(random_walk_env(), gamma_dt=0.1).load_replay_buffer(tmp_path / "buffer")
+
+
+def test_with_one_step_options_targets_and_losses_are_sacs():
+    """n_rbf = 1 and d = dt, no penalty, entropy as log π, R in the unit of a step's reward: SAC's numbers."""
+    kwargs = {"policy_kwargs": {"net_arch": [16]}, "learning_starts": 20, "seed": 0, "device": "cpu", "gamma": 0.97}
+    sac = SAC("MlpPolicy", "Pendulum-v1", ent_coef=0.5, **kwargs).learn(60)
+    options = {"n_rbf": 1, "d_min": 0.05, "d_max": 0.05, "n_sub_options": 0, "high_freq_penalty": 0.0}
+    unit = {"reward_scale": "gamma_dt", "gamma_dt": 0.05, "entropy_reference": "paper"}
+    model = CTCO("MlpPolicy", "Pendulum-v1", ent_coef=0.5, **options, **unit, **kwargs).learn(60)
+    copy_weights(sac, model)
+    # The same experience: an option is a normalised action and a duration; its R is in reward × s.
+    data = sac.replay_buffer.sample(32)
+    as_option = lambda action: th.cat((action, th.zeros(len(action), 1)), dim=1)  # noqa: E731
+    as_log_prob = lambda log_prob: th.stack((log_prob, th.zeros(len(log_prob))), dim=1)  # noqa: E731
+    r = data.rewards * step_weight(0.05, model.discount_rate) * model.replay_buffer.reward_scale
+    option_data = data._replace(actions=as_option(data.actions), rewards=r, discounts=th.full((32, 1), 0.97))
+
+    with th.no_grad():
+        next_actions, next_log_prob = sac.actor.action_log_prob(data.next_observations)
+        # Lines of SAC.train, Stable-Baselines3 2.9
+        next_q_values = th.cat(sac.critic_target(data.next_observations, next_actions), dim=1).amin(dim=1, keepdim=True)
+        expected = data.rewards + (1 - data.dones) * 0.97 * (next_q_values - 0.5 * next_log_prob[:, None])
+        values = model.critic_target(data.next_observations, as_option(next_actions))
+        targets = model._targets(option_data, values, model.entropy_costs(as_log_prob(next_log_prob)))
+    th.testing.assert_close(targets, expected, rtol=1e-6, atol=1e-6)
+    critics_loss = 0.5 * sum(th.nn.functional.mse_loss(q, expected) for q in sac.critic(data.observations, data.actions))
+    found = critic_loss(model.critic(data.observations, option_data.actions), targets)
+    th.testing.assert_close(found, critics_loss, rtol=1e-6, atol=1e-6)
+    actions, log_prob = sac.actor.action_log_prob(data.observations)
+    q_min = th.cat(sac.critic(data.observations, actions), dim=1).amin(dim=1, keepdim=True)
+    found = model._actor_loss(data.observations, (as_option(actions), as_log_prob(log_prob)))
+    th.testing.assert_close(found, (0.5 * log_prob[:, None] - q_min).mean(), rtol=1e-6, atol=1e-6)
+    mean, log_std, _ = sac.actor.get_action_dist_params(data.observations)
+    for found, one in zip(model.actor.distribution_parameters(data.observations), (mean, log_std), strict=True):
+        th.testing.assert_close(found[:, :1], one, rtol=1e-6, atol=1e-6)
+
+
+@th.no_grad()
+def copy_weights(sac, model):
+    """SAC's networks of one hidden layer as CTCO's; a fixed duration has no part in values."""
+    for source, target in ((sac.critic, model.critic), (sac.critic_target, model.critic_target)):
+        for i, network in enumerate((source.qf0, source.qf1)):
+            for layer in (0, 2):
+                weight = network[layer].weight.T
+                target.q_networks[layer].weight[i].zero_()
+                target.q_networks[layer].weight[i][: len(weight)] = weight
+                target.q_networks[layer].bias[i] = network[layer].bias
+    model.actor.latent_pi.load_state_dict(sac.actor.latent_pi.state_dict())
+    for layer, rows in ((sac.actor.mu, slice(1)), (sac.actor.log_std, slice(1, None))):
+        model.actor.omega_head.weight[rows], model.actor.omega_head.bias[rows] = layer.weight, layer.bias
 
 
 class StaleOptionsEnv(gym.Env):
@@ -292,6 +415,7 @@ def test_one_update_by_hand(random_walk_env):
         ent_coef=0.2,
         duration_ent_coef=0.4,
         high_freq_penalty=0.05,
+        canonical_weights=False,
     )
     model.learn(200)
     # Let the targets differ from what they follow.
@@ -429,7 +553,7 @@ def test_options_of_one_step_are_sac(scripted_env):
     with th.no_grad():
         options, log_prob = model.actor_target.option_log_prob(ours.next_observations)
         next_q = model.critic_target(ours.next_observations, options).amin(dim=0)
-        target = critic_target(ours.rewards, ours.dones, ours.discounts, next_q, model.entropy_costs(options, log_prob), 0.0)
+        target = critic_target(ours.rewards, ours.dones, ours.discounts, next_q, model.entropy_costs(log_prob), 0.0)
         # SAC's target, with the tanh Gaussian of the action alone
         mean, log_std = model.actor_target.distribution_parameters(theirs.next_observations)
         action = options[:, :1].double()
@@ -443,8 +567,8 @@ def test_options_of_one_step_are_sac(scripted_env):
 
 def test_a_bare_environment_is_wrapped(random_walk_env):
     model = make(random_walk_env(), n_rbf=2, d_max=0.7, gamma=0.9, gamma_dt=0.1)
-    settings = model.get_env().get_attr("option_settings")[0]
-    assert (settings.n_rbf, settings.d_max, settings.d_min, settings.dt) == (2, 0.7, 0.1, 0.1)
+    settings = model.get_env().get_attr("option_space")[0]
+    assert (settings.trajectory.n_weights, settings.d_max, settings.d_min, settings.dt) == (2, 0.7, 0.1, 0.1)
     assert settings.discount_rate == pytest.approx(-math.log(0.9) / 0.1)
     assert (model.dt, model.d_min) == (0.1, 0.1)
     assert model.action_space.shape == (3,)
@@ -464,7 +588,7 @@ def test_a_wrapped_environment_is_used_as_it_is(random_walk_env):
     ("wrapper", "algorithm", "name"),
     [
         ({"n_rbf": 2}, {}, "n_rbf"),
-        ({"d_max": 0.5}, {}, "d_max"),
+        ({"d_max": 0.6}, {}, "d_max"),
         ({"d_min": 0.2}, {"d_min": 0.3}, "d_min"),
         ({}, {"dt": 0.2}, "dt"),
         ({"discount_rate": 0.1}, {}, "discount_rate"),
@@ -616,7 +740,7 @@ def test_save_and_load(tmp_path, random_walk_env):
 
     bare = CTCO.load(tmp_path / "model", env=random_walk_env())
     np.testing.assert_array_equal(bare.predict(obs, deterministic=True)[0], expected)
-    assert bare.get_env().get_attr("option_settings")[0].d_max == 0.7
+    assert bare.get_env().get_attr("option_space")[0].d_max == 0.7
 
     wrapped = OptionExecutionWrapper(random_walk_env(), n_rbf=2, d_max=0.7, d_min=0.2)
     CTCO.load(tmp_path / "model", env=wrapped).learn(30)
@@ -718,7 +842,7 @@ def test_greedy_options_are_the_means(random_walk_env):
     obs = np.array([[0.3, 0.1]], dtype=np.float32)
     mean = model.actor.distribution_parameters(th.as_tensor(obs))[0][0].detach().numpy()
     expected = np.append(np.tanh(mean[:-1]), 2 / (1 + math.exp(-mean[-1])) - 1)
-    np.testing.assert_allclose(model.predict(obs, deterministic=True)[0][0], expected, rtol=1e-5)
+    np.testing.assert_allclose(model.predict(obs, deterministic=True)[0][0].vector, expected, rtol=1e-5)
     assert not np.allclose(model.predict(obs)[0], model.predict(obs)[0])
 
 

@@ -10,6 +10,7 @@ from stable_baselines3.common.buffers import RolloutBuffer
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.evaluation import evaluate_policy
 from stable_baselines3.common.logger import KVWriter, Logger
+from stable_baselines3.common.torch_layers import NatureCNN
 from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecNormalize
 from torch.distributions import Normal
 
@@ -512,8 +513,36 @@ def test_actors_and_critic_of_different_sizes(random_walk_env):
     for networks in (policy.master, policy.option_means, policy.terminations):
         assert [layer.weight.shape[-1] for layer in networks[::2]][:-1] == [6, 5]
     assert [layer.weight.shape[-1] for layer in policy.q_network[::2]][:-1] == [9]
+    # As in PPO, what is left out has no hidden layers.
+    policy = make(random_walk_env(), policy_kwargs={"net_arch": {"pi": [6]}}).policy
+    assert [layer.weight.shape[-1] for layer in policy.master[::2]] == [6, 4]
+    assert [layer.weight.shape[-1] for layer in policy.q_network[::2]] == [4]
     with pytest.raises(ValueError, match=r"net_arch must be a list of sizes, or dict\(pi=..., vf=...\)"):
-        make(random_walk_env(), policy_kwargs={"net_arch": {"pi": [6]}})
+        make(random_walk_env(), policy_kwargs={"net_arch": {"pi": [6], "qf": [9]}})
+
+
+@pytest.mark.parametrize("share", [False, True])
+def test_features_of_its_own_for_the_critic(random_walk_env, tmp_path, share):
+    kwargs = {"share_features_extractor": share, "features_extractor_class": NatureCNN}
+    model = make(random_walk_env("image"), policy_kwargs=kwargs, n_steps=8, n_epochs=1).learn(8)
+    policy = model.policy
+    obs, _ = policy.obs_to_tensor(np.full((1, 3, 36, 36), 90, np.uint8))
+    policy.zero_grad()
+    policy.options(obs).q_values.sum().backward()
+    moved = {name.split(".")[0] for name, parameter in policy.named_parameters() if parameter.grad is not None}
+    assert moved == {"q_network", "features_extractor" if share else "vf_features_extractor"}
+    policy.save(tmp_path / "policy.pt")
+    assert policy.load(tmp_path / "policy.pt", device="cpu").share_features_extractor is share
+
+
+def test_the_clip_range_is_a_schedule(random_walk_env, tmp_path):
+    """As PPO's: it is called with the remaining progress, is logged, and can be changed while loading."""
+    model = make(random_walk_env(), clip_range=lambda remaining: 0.1 + 0.2 * remaining, n_steps=8).learn(32)
+    assert model.clip_range(1.0) == pytest.approx(0.3)
+    assert model.logger.name_to_value["train/clip_range"] == pytest.approx(0.1)
+    model.save(tmp_path / "model")
+    assert DACPPO.load(tmp_path / "model").clip_range(0.5) == pytest.approx(0.2)
+    assert DACPPO.load(tmp_path / "model", clip_range=0.4).clip_range(0.5) == pytest.approx(0.4)
 
 
 # --- learning

@@ -239,6 +239,40 @@ def test_rolled_out_options_are_those_of_dm_controls_functions(domain, task, dt)
         assert end == [False, True]
 
 
+@pytest.mark.parametrize(("domain", "task"), [("point_mass", "easy"), ("cheetah", "run"), ("ball_in_cup", "catch")])
+@pytest.mark.parametrize("inputs", ["xfrc_applied", "qfrc_applied"])
+def test_external_forces_push(domain, task, inputs):
+    """As in dm_control's own functions step by step, and no longer than they are set."""
+    fast, plain, free = (make(domain, task, dt=0.01, time_limit=2.0).unwrapped for _ in range(3))
+    plain._rewards = None
+    for env in (fast, plain, free):
+        env.reset(seed=0)
+    rng = np.random.default_rng(0)
+    for force in (1.0, 0.0, 1.0):
+        actions = rng.uniform(-1, 1, (40, *fast.action_space.shape))
+        for env in (fast, plain):
+            forces = getattr(env._data, inputs)
+            forces[...] = 0.0
+            forces[(-1, 0) if inputs == "xfrc_applied" else -1] = force
+        (obs, rewards, *_), (obs2, rewards2, *_) = (env.step_sequence(actions) for env in (fast, plain))
+        free.step_sequence(actions)
+        np.testing.assert_allclose(obs, obs2, rtol=0, atol=1e-6)
+        np.testing.assert_allclose(rewards, rewards2, rtol=0, atol=1e-9)
+        assert getattr(fast._data, inputs).sum() == force
+    assert np.abs(fast._data.qpos - free._data.qpos).max() > 1e-3
+
+
+def test_the_same_seed_is_the_same_world():
+    """dm_control draws lqr's stiffnesses and dampings where it makes the model."""
+    one, other = (make("lqr", "lqr_6_2").unwrapped for _ in range(2))
+    np.testing.assert_array_equal(one._model.jnt_stiffness, other._model.jnt_stiffness)
+    np.testing.assert_array_equal(one._model.dof_damping, other._model.dof_damping)
+    starts = [env.reset(seed=3)[0] for env in (one, other)]
+    np.testing.assert_array_equal(*starts)
+    ends = [env.step_sequence(np.ones((20, 2)))[0] for env in (one, other)]
+    np.testing.assert_array_equal(*ends)
+
+
 @pytest.mark.parametrize(
     ("kwargs", "message"),
     [({"dt": 0.0}, "dt"), ({"time_limit": -1.0}, "time_limit"), ({"render_mode": "human"}, "render_mode")],

@@ -15,6 +15,7 @@ ROOT = Path(__file__).parent.parent
 PAGES = sorted(page for page in (ROOT / "docs").glob("*.md") if "```python" in page.read_text())
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: page.stem)
 def test_snippets_run(page, tmp_path, monkeypatch):
     """All Python blocks of a page, one after the other in one namespace, with short trainings.
@@ -39,7 +40,31 @@ def test_sphinx_builds_without_warnings(tmp_path):
     command = [sys.executable, "-m", "sphinx", "-W", "--keep-going", "-q", "-b", "html", str(ROOT / "docs"), str(tmp_path)]
     result = subprocess.run(command, capture_output=True, text=True, check=False)
     assert result.returncode == 0, result.stderr
+    pages = [page.read_text() for page in tmp_path.glob("*.html")]
     assert (tmp_path / "ctco.html").exists()
+    # What a page loads, as opposed to what it links to, comes with it: no scripts, fonts or formulas from the net.
+    loaded = re.findall(r"<(?:script|img|link)[^>]*(?:src|href)=\"(?:https?:)?//([^\"]*)", "".join(pages))
+    assert loaded == []
+    # Numbers that two pages need stand on one of them.
+    assert any("What each ingredient is worth" in page for page in pages)
+
+
+def test_the_installation_page_has_every_extra():
+    extras = re.search(
+        r"^\[project.optional-dependencies\]$(.*?)^\[", (ROOT / "pyproject.toml").read_text(), re.DOTALL | re.MULTILINE
+    )
+    names = re.findall(r"^([a-z-]+) = \[", extras.group(1), re.MULTILINE)
+    assert "dm-control" in names
+    page = (ROOT / "docs" / "installation.md").read_text()
+    assert [name for name in names if f"| `{name}` |" not in page] == []
+
+
+def test_the_environments_page_has_every_task():
+    from sb3_ctco.envs import DM_CONTROL_TASKS
+
+    page = (ROOT / "docs" / "environments.md").read_text()
+    rows = dict(re.findall(r"^\| `(\w+)` \| (`[^|]*`) \|", page, re.MULTILINE))
+    assert {domain: tuple(re.findall(r"`(\w+)`", rows.get(domain, ""))) for domain in DM_CONTROL_TASKS} == DM_CONTROL_TASKS
 
 
 def run_example(name: str, folder: Path, *arguments: str) -> str:
@@ -47,6 +72,7 @@ def run_example(name: str, folder: Path, *arguments: str) -> str:
     return subprocess.run(command, capture_output=True, text=True, check=True, cwd=folder).stdout
 
 
+@pytest.mark.slow
 def test_watch(tmp_path):
     from sb3_ctco import CTCO
 

@@ -10,7 +10,7 @@ from stable_baselines3 import SAC
 from stable_baselines3.common.vec_env import DummyVecEnv
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
-from sb3_ctco import CTCO, OptionExecutionWrapper
+from sb3_ctco import CTCO, OptionExecutionWrapper, RewardRateWrapper
 from sb3_ctco.common.evaluation import (
     DiscountedReturnCallback,
     evaluate_discounted_return,
@@ -67,6 +67,36 @@ def test_returns_of_both_kinds_are_the_integral_by_hand():
     # Three options of three steps and one cut off after one
     assert (plain.decisions, by_options.decisions) == (10, 4)
     assert by_options.decision_rate_hz == pytest.approx(4.0)
+
+
+def test_the_rate_of_discounting_is_the_environments():
+    options = OptionExecutionWrapper(CountingEnv(), n_rbf=1, d_max=0.3, discount_rate=TAU)
+    (given,) = evaluate_discounted_return(Scripted([0.0, 1.0]), options, 1, discount_rate=TAU)
+    (found,) = evaluate_discounted_return(Scripted([0.0, 1.0]), options, 1)
+    assert found == given
+    # Within options the environment has discounted already, so another rate between them would be neither.
+    with pytest.raises(ValueError, match=r"discount_rate=\[0.5\], within them, so not at 0.4 between them"):
+        evaluate_discounted_return(Scripted([0.0, 1.0]), options, 1, discount_rate=0.4)
+    fixed = RewardRateWrapper(CountingEnv(), discount_rate=TAU)
+    (by_steps,) = evaluate_discounted_return(Scripted([0.0]), fixed, 1)
+    assert by_steps.discounted_return == pytest.approx(given.discounted_return)
+    mixed = DummyVecEnv(
+        [lambda rate=rate: OptionExecutionWrapper(CountingEnv(), n_rbf=1, discount_rate=rate) for rate in (0.5, 0.6)]
+    )
+    with pytest.raises(ValueError, match=r"discount_rate=\[0.5, 0.6\]"):
+        evaluate_discounted_return(Scripted([0.0, 1.0]), mixed, 1)
+
+
+def test_the_callback_discounts_as_the_environment_does():
+    kwargs = {"gamma": 0.9, "learning_starts": 1000, "d_max": 0.3, "n_sub_options": 0, "buffer_size": 100}
+    callback = DiscountedReturnCallback()
+    model = CTCO("MlpPolicy", CountingEnv(), **kwargs).learn(10, callback)
+    tau = -math.log(0.9) / 0.05
+    weight = (1 - math.exp(-tau * DT)) / tau
+    expected = sum(k * math.exp(-tau * DT * (k - 1)) * weight for k in range(1, 11))
+    assert callback.episodes[0].discounted_return == pytest.approx(expected)
+    with pytest.raises(ValueError, match=r"not at 0\.5 between them"):
+        model.learn(10, DiscountedReturnCallback(discount_rate=0.5))
 
 
 def test_jerk_by_hand():

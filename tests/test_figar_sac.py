@@ -16,10 +16,10 @@ from stable_baselines3.common.type_aliases import ReplayBufferSamples
 
 from sb3_ctco import FiGARSAC, OptionController, OptionExecutionWrapper, RewardRateWrapper
 from sb3_ctco.common import soft_actor_critic
+from sb3_ctco.common.losses import repeated_actor_loss, repetition_values
 from sb3_ctco.export import export_onnx
-from sb3_ctco.figar_sac.figar_sac import actor_loss, repetition_values
 from sb3_ctco.figar_sac.policies import FiGARSACPolicy, decode_repetitions, encode_repetitions
-from sb3_ctco.options import OptionSettings, discount
+from sb3_ctco.options import OptionSpace, discount
 
 SMALL = {"policy_kwargs": {"net_arch": [8]}, "batch_size": 8, "device": "cpu", "seed": 0, "learning_starts": 20}
 
@@ -48,7 +48,7 @@ def test_expectation_over_repetitions_by_hand():
 
 def test_actor_loss_by_hand():
     # L_a = 0.2·(−1.5) − 2.5; L_x = −(2.5 + 0.5·H)
-    loss = actor_loss(Q_VALUES, th.tensor([-1.5]), LOG_PROBS, th.tensor([0.2, 0.5]))
+    loss = repeated_actor_loss(Q_VALUES, th.tensor([-1.5]), LOG_PROBS, th.tensor([0.2, 0.5]))
     assert loss.item() == pytest.approx(-0.3 - 2.5 - 2.5 - 0.5 * ENTROPY)
 
 
@@ -56,7 +56,7 @@ def test_each_part_of_the_policy_is_moved_with_the_other_one_held_fixed():
     q_values = Q_VALUES.clone().requires_grad_(True)
     logits = LOG_PROBS.clone().requires_grad_(True)
     log_prob = th.tensor([-1.5], requires_grad=True)
-    actor_loss(q_values, log_prob, logits.log_softmax(dim=1), th.tensor([0.2, 0.5])).backward()
+    repeated_actor_loss(q_values, log_prob, logits.log_softmax(dim=1), th.tensor([0.2, 0.5])).backward()
     # The action climbs Σ_k π_x(k)·min_i Q_k: −π_x for the smaller critic of each k, through L_a alone.
     th.testing.assert_close(q_values.grad, th.tensor([[[-0.25, 0.0]], [[0.0, -0.75]]]))
     assert log_prob.grad.item() == pytest.approx(0.2)
@@ -112,7 +112,7 @@ def test_the_critic_learns_the_repetition_that_ran(random_walk_env):
 @pytest.mark.parametrize("n", [*range(1, 25), 79, 100, 127, 300, 517])
 def test_repetitions_are_exact(dt, n):
     """Each k of {1, …, K} becomes k steps, whether numpy or torch encodes it, in single precision."""
-    option = OptionSettings(n_rbf=1, d_max=n * dt, d_min=dt, dt=dt, discount_rate=0.0)
+    option = OptionSpace.make(n_rbf=1, d_max=n * dt, d_min=dt, dt=dt, discount_rate=0.0)
     repetitions = np.arange(1, n + 1, dtype=np.float32)
     for encoded in (encode_repetitions(repetitions, n), encode_repetitions(th.tensor(repetitions), n).numpy()):
         assert encoded.dtype == np.float32
@@ -125,7 +125,7 @@ def test_repetitions_are_exact(dt, n):
 @given(n=st.integers(1, 5000), dt=st.floats(1e-4, 10.0), share=st.floats(0.0, 1.0))
 def test_any_repetition_is_exact(n, dt, share):
     k = 1 + round(share * (n - 1))
-    option = OptionSettings(n_rbf=1, d_max=n * dt, d_min=dt, dt=dt, discount_rate=0.0)
+    option = OptionSpace.make(n_rbf=1, d_max=n * dt, d_min=dt, dt=dt, discount_rate=0.0)
     encoded = encode_repetitions(np.array([k], dtype=np.float32), n)
     assert option.decode(np.array([0.0, encoded[0]], dtype=np.float32))[1] == k
 
@@ -291,8 +291,8 @@ def test_temperature_of_the_repetition_follows_its_entropy(random_walk_env):
 
 def test_a_bare_environment_is_wrapped(random_walk_env):
     model = make(random_walk_env(), n_repetitions=7)
-    one = model.get_env().get_attr("option_settings")[0]
-    assert (one.n_rbf, one.d_min, one.dt) == (1, 0.1, 0.1)
+    one = model.get_env().get_attr("option_space")[0]
+    assert (one.trajectory.n_weights, one.d_min, one.dt) == (1, 0.1, 0.1)
     assert one.d_max == pytest.approx(0.7)
     assert make(random_walk_env()).n_repetitions == 20
     assert model.critic(th.zeros(2, 2), th.zeros(2, 1)).shape == (2, 2, 7)

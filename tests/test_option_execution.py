@@ -7,12 +7,15 @@ from gymnasium import spaces
 from gymnasium.error import ResetNeeded
 from gymnasium.utils.env_checker import check_env as gymnasium_check_env
 from gymnasium.wrappers import RecordVideo, TimeLimit, TransformReward
+from stable_baselines3 import SAC
 from stable_baselines3.common.env_checker import check_env as sb3_check_env
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.evaluation import evaluate_policy
 from stable_baselines3.common.monitor import Monitor
 
-from sb3_ctco.options import action_plan
+from sb3_ctco import CTCO
+from sb3_ctco.common.sac_at_rate import sac_at_rate
+from sb3_ctco.options import RadialBasis
 from sb3_ctco.wrappers import OptionExecutionWrapper, SupportsStepSequence, find_dt
 
 TAU = math.log(2.0)  # half in a second
@@ -73,7 +76,7 @@ def test_actions_are_mapped_to_the_bounds_of_any_shape(scripted_env):
     # ω is [action_dim, n_rbf] flattened: the first two weights drive the first action entry, halfway up its range.
     omega = np.array([[0.0, 0.0], [1.0, -1.0], [0.0, 0.0], [0.0, 0.0]])
     env.step(np.concatenate([omega.ravel(), [1.0]]))
-    plan = action_plan(omega, 3)
+    plan = RadialBasis(omega.shape[1]).plan(omega, 3)
     for action, expected in zip(env.unwrapped.actions[-3:], plan, strict=True):
         np.testing.assert_allclose(action, [[0.5, 3.0 * expected[1]], [5.5, -0.5]], rtol=1e-6)
 
@@ -162,6 +165,115 @@ def test_bad_rewards_and_observations(scripted_env, bad):
         env.step([0.0, 1.0])
 
 
+class Faulty(gym.Env):
+    """Has faults: ``"reset"`` is what it returns from it, ``"step"`` what it returns from its third step on."""
+
+    dt = 0.1
+    action_space = spaces.Box(-1.0, 1.0, (1,), np.float32)
+
+    def __init__(self, kind):
+        vector = spaces.Box(-1.0, 1.0, (2,), np.float32)
+        self.observation_space = vector if kind == "vector" else spaces.Dict({"x": vector, "n": spaces.Discrete(9)})
+        self.good = np.zeros(2, np.float32) if kind == "vector" else {"x": np.zeros(2, np.float32), "n": 3}
+        self.faults = {}
+
+    def reset(self, *, seed=None, options=None):
+        self.count = 0
+        return self.faults.get("reset", (self.good, {}))
+
+    def step(self, action):
+        self.count += 1
+        good = (self.good, 0.0, False, False, {})
+        return self.faults.get("step", good) if self.count >= 3 else good
+
+
+GOOD, NAN, INF = np.zeros(2, np.float32), np.array([0.0, np.nan], np.float32), np.array([-np.inf, 0.0], np.float32)
+#: What an environment with vectors returns from reset, and what is said
+BAD_RESETS = [
+    (None, TypeError, "must return an observation and an info"),
+    (GOOD, TypeError, "must return an observation and an info"),
+    ((GOOD,), TypeError, "must return an observation and an info"),
+    ((GOOD, None), TypeError, "must return an observation and an info"),
+    ((NAN, {}), ValueError, "observation that is not finite"),
+    ((INF, {}), ValueError, "observation that is not finite"),
+    ((np.zeros(3), {}), ValueError, r"shape \(3,\), not its space's \(2,\)"),
+    ((np.zeros((1, 2)), {}), ValueError, r"shape \(1, 2\), not its space's \(2,\)"),
+    ((None, {}), ValueError, r"shape \(\), not its space's \(2,\)"),
+]
+#: The same from the third step on
+BAD_STEPS = [
+    (None, TypeError, "must return observation, reward, terminated, truncated and info"),
+    ((GOOD, 0.0, False, {}), TypeError, "must return observation, reward, terminated, truncated and info"),
+    ((GOOD, 0.0, False, False, None), TypeError, "info None, which must be a dictionary"),
+    ((GOOD, 0.0, None, False, {}), TypeError, "terminated=None, which must be True or False"),
+    ((GOOD, 0.0, False, None, {}), TypeError, "truncated=None, which must be True or False"),
+    ((GOOD, 0.0, False, "no", {}), TypeError, "truncated='no', which must be True or False"),
+    ((GOOD, np.nan, False, False, {}), ValueError, "reward that is not finite"),
+    ((GOOD, None, False, False, {}), TypeError, "a real number, not 'NoneType'"),
+    ((NAN, 0.0, False, False, {}), ValueError, "observation that is not finite"),
+    ((NAN, 0.0, True, False, {}), ValueError, "observation that is not finite"),
+    ((np.zeros((1, 2)), 0.0, False, False, {}), ValueError, r"shape \(1, 2\), not its space's \(2,\)"),
+    ((None, 0.0, False, False, {}), ValueError, r"shape \(\), not its space's \(2,\)"),
+]
+#: Likewise of an environment with dictionaries
+BAD_DICTS = [
+    ({"x": NAN, "n": 3}, r"has a 'x' that is not finite"),
+    ({"x": np.zeros(3), "n": 3}, r"has a 'x' that has the shape \(3,\), not its space's \(2,\)"),
+    ({"x": GOOD}, r"is no dictionary of \['n', 'x'\]"),
+    (GOOD, r"is no dictionary of \['n', 'x'\]"),
+]
+BAD_ENVIRONMENTS = [
+    *[("vector", {"reset": given}, error, message) for given, error, message in BAD_RESETS],
+    *[("vector", {"step": given}, error, message) for given, error, message in BAD_STEPS],
+    *[("dict", {"reset": (given, {})}, ValueError, message) for given, message in BAD_DICTS],
+    *[("dict", {"step": (given, 0.0, False, False, {})}, ValueError, message) for given, message in BAD_DICTS],
+]
+
+
+@pytest.mark.parametrize("n_sub_options", [0, 4])
+@pytest.mark.parametrize(("kind", "faults", "error", "message"), BAD_ENVIRONMENTS)
+def test_what_an_environment_must_not_return_is_not_stored(kind, faults, error, message, n_sub_options):
+    """What was given, what is said, and that the buffer is as before; the first option, of two steps, is good."""
+    env = Faulty(kind)
+    model = CTCO(
+        "MlpPolicy" if kind == "vector" else "MultiInputPolicy",
+        env,
+        d_min=0.2,
+        d_max=0.2,
+        n_sub_options=n_sub_options,
+        learning_starts=100,
+        buffer_size=50,
+        policy_kwargs={"net_arch": [4]},
+    ).learn(2)
+    assert model.replay_buffer.size() == 1
+    env.faults = faults
+    with pytest.raises(error, match=message):
+        model.learn(2, reset_num_timesteps="reset" in faults)
+    assert model.replay_buffer.size() == 1
+
+
+def test_environments_whose_reset_takes_a_seed_alone():
+    class Env(Faulty):
+        def reset(self, seed=None):
+            return super().reset()
+
+    SAC("MlpPolicy", Env("vector"), learning_starts=10).learn(2)
+    CTCO("MlpPolicy", Env("vector"), learning_starts=10).learn(2)
+    sac_at_rate(Env("vector"), dt=0.1).learn(2)
+
+
+@pytest.mark.parametrize("shape", [(), (1,), (1, 1)])
+def test_a_reward_may_be_an_array_of_one_number(scripted_env, shape):
+    env = wrap(scripted_env(rewards=lambda step, action: np.full(shape, 2.0)), d_max=0.3)
+    env.reset()
+    _, reward, _, _, info = env.step([0.0, 1.0])
+    assert reward == 6.0
+    assert info["option"]["integrated_reward"] == pytest.approx(2.0 * (1 - 0.5**0.3) / TAU)
+    env.unwrapped.rewards = lambda step, action: np.zeros(2)
+    with pytest.raises(ValueError, match="rewards that are no numbers"):
+        env.step([0.0, 1.0])
+
+
 @pytest.mark.parametrize("option", [[0.0], [0.0, 0.0, 0.0], [np.nan, 0.0], [0.0, np.inf]])
 def test_bad_options(scripted_env, option):
     env = wrap(scripted_env())
@@ -200,7 +312,7 @@ def test_dt_is_found(scripted_env):
     assert find_dt(env) == pytest.approx(0.02)
     assert find_dt(gym.make("Pendulum-v1")) == pytest.approx(0.05)
     # An explicit dt goes before everything found.
-    assert wrap(env, dt=0.5).option_settings.dt == 0.5
+    assert wrap(env, dt=0.5).option_space.dt == 0.5
 
 
 def test_dt_that_is_not_found(scripted_env):
@@ -329,7 +441,7 @@ def test_the_spec_rebuilds_the_environment():
     env = OptionExecutionWrapper(gym.make("Pendulum-v1"), n_rbf=2, d_max=0.5, reward="integral")
     again = gym.make(env.spec)
     assert isinstance(again, OptionExecutionWrapper)
-    assert again.option_settings == env.option_settings
+    assert again.option_space == env.option_space
     assert again.reward == "integral"
 
 

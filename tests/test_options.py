@@ -9,23 +9,29 @@ from hypothesis.extra import numpy as hnp
 
 from sb3_ctco.options import (
     DEFAULT_DISCOUNT_RATE,
-    OptionSettings,
-    action_plan,
-    basis,
+    TRAJECTORIES,
+    BezierCurve,
+    OptionSpace,
+    RadialBasis,
     basis_of_steps,
     discount,
     discount_rate_from_gamma,
-    fit_slices,
     integrated_reward,
     step_weight,
     steps_in,
 )
 
+
+def plan_of(omega, n_steps):
+    """The actions of radial basis functions, as many as ω has weights."""
+    return RadialBasis(omega.shape[1]).plan(omega, n_steps)
+
+
 # --- basis, worked by hand from centres linspace(−0.5/n, 1 + 0.5/n, n) and variance ½((1 + 1/n)/n)²
 
 
 def test_one_basis_function_is_constant():
-    np.testing.assert_array_equal(basis(np.array([0.0, 0.3, 0.99]), 1), np.ones((3, 1)))
+    np.testing.assert_array_equal(RadialBasis(1).basis(np.array([0.0, 0.3, 0.99])), np.ones((3, 1)))
 
 
 def test_two_basis_functions():
@@ -33,28 +39,30 @@ def test_two_basis_functions():
     a, b = math.exp(-1 / 9), math.exp(-25 / 9)
     # At x = 0.5 both are equally far.
     expected = [[a / (a + b), b / (a + b)], [0.5, 0.5]]
-    np.testing.assert_allclose(basis(np.array([0.0, 0.5]), 2), expected, rtol=1e-12)
+    np.testing.assert_allclose(RadialBasis(2).basis(np.array([0.0, 0.5])), expected, rtol=1e-12)
 
 
 def test_three_basis_functions():
     # Centres −1/6, 1/2, 7/6, variance ½·(4/9)², so φ ∝ exp(−(x − c)²·81/16).
     e = [math.exp(-((0.25 - c) ** 2) * 81 / 16) for c in (-1 / 6, 1 / 2, 7 / 6)]
-    np.testing.assert_allclose(basis(np.array([0.25]), 3), [[x / sum(e) for x in e]], rtol=1e-12)
+    np.testing.assert_allclose(RadialBasis(3).basis(np.array([0.25])), [[x / sum(e) for x in e]], rtol=1e-12)
     # By symmetry about x = 1/2.
-    np.testing.assert_allclose(basis(np.array([0.25]), 3)[0], basis(np.array([0.75]), 3)[0, ::-1], rtol=1e-12)
+    np.testing.assert_allclose(
+        RadialBasis(3).basis(np.array([0.25]))[0], RadialBasis(3).basis(np.array([0.75]))[0, ::-1], rtol=1e-12
+    )
 
 
 def test_basis_of_steps_are_the_phases_k_over_n():
-    np.testing.assert_array_equal(basis_of_steps(4, 3), basis(np.array([0.0, 0.25, 0.5, 0.75]), 3))
+    np.testing.assert_array_equal(basis_of_steps(RadialBasis(3), 4), RadialBasis(3).basis(np.array([0.0, 0.25, 0.5, 0.75])))
     with pytest.raises(ValueError, match="read-only"):
-        basis_of_steps(4, 3)[0, 0] = 1.0
+        basis_of_steps(RadialBasis(3), 4)[0, 0] = 1.0
 
 
 def test_plan_of_two_dimensions_by_hand():
     omega = np.array([[1.0, -1.0], [0.5, 0.5]])
     a, b = math.exp(-1 / 9), math.exp(-25 / 9)
     # Steps at phases 0 and 0.5; equal weights give a constant.
-    np.testing.assert_allclose(action_plan(omega, 2), [[(a - b) / (a + b), 0.5], [0.0, 0.5]], atol=1e-12)
+    np.testing.assert_allclose(plan_of(omega, 2), [[(a - b) / (a + b), 0.5], [0.0, 0.5]], atol=1e-12)
 
 
 @given(
@@ -62,11 +70,11 @@ def test_plan_of_two_dimensions_by_hand():
     st.integers(1, 300),
 )
 def test_actions_stay_in_the_box_of_the_weights(omega, n_steps):
-    plan = action_plan(omega, n_steps)
+    plan = plan_of(omega, n_steps)
     assert plan.shape == (n_steps, omega.shape[0])
     assert (plan <= omega.max(axis=1) + 1e-12).all()
     assert (plan >= omega.min(axis=1) - 1e-12).all()
-    np.testing.assert_allclose(basis_of_steps(n_steps, omega.shape[1]).sum(axis=1), 1.0)
+    np.testing.assert_allclose(basis_of_steps(RadialBasis(omega.shape[1]), n_steps).sum(axis=1), 1.0)
 
 
 # --- discount and integrated reward
@@ -147,7 +155,7 @@ def test_durations_are_rounded_half_up_to_at_least_one_step(duration, dt, expect
 
 
 def test_decode():
-    settings = OptionSettings(n_rbf=2, d_max=1.0, d_min=0.2, dt=0.1, discount_rate=0.4)
+    settings = OptionSpace.make(n_rbf=2, d_max=1.0, d_min=0.2, dt=0.1, discount_rate=0.4)
     omega, n_steps = settings.decode(np.array([0.1, 0.2, 0.3, 0.4, 0.0]))
     np.testing.assert_array_equal(omega, [[0.1, 0.2], [0.3, 0.4]])
     assert n_steps == 6  # the middle of [0.2, 1.0] s
@@ -174,9 +182,9 @@ def test_decode():
 )
 def test_settings_out_of_range(change, error):
     good = {"n_rbf": 3, "d_max": 1.0, "d_min": 0.1, "dt": 0.1, "discount_rate": 0.4}
-    OptionSettings(**good)
+    OptionSpace.make(**good)
     with pytest.raises(error, match=next(iter(change))):
-        OptionSettings(**{**good, **change})
+        OptionSpace.make(**{**good, **change})
 
 
 # --- sub-options
@@ -187,7 +195,7 @@ def test_settings_out_of_range(change, error):
     st.integers(1, 60),
 )
 def test_a_fit_over_the_whole_option_returns_its_weights(omega, n_steps):
-    [fitted], [residual] = fit_slices(action_plan(omega, n_steps), np.array([0]), np.array([n_steps]), omega.shape[1])
+    [fitted], [residual] = RadialBasis(omega.shape[1]).fit(plan_of(omega, n_steps), np.array([0]), np.array([n_steps]))
     if n_steps >= omega.shape[1]:  # with fewer, the weights nearest to the mean may leave the box, and are clipped
         assert residual < 1e-9
     if n_steps >= 2 * omega.shape[1]:  # enough steps to tell the weights apart
@@ -195,8 +203,8 @@ def test_a_fit_over_the_whole_option_returns_its_weights(omega, n_steps):
 
 
 def test_slices_of_repeated_actions_are_exact():
-    plan = action_plan(np.array([[0.3], [-1.0]]), 17)
-    omega, residuals = fit_slices(plan, np.array([0, 3, 16, 1]), np.array([1, 9, 17, 17]), 1)
+    plan = plan_of(np.array([[0.3], [-1.0]]), 17)
+    omega, residuals = RadialBasis(1).fit(plan, np.array([0, 3, 16, 1]), np.array([1, 9, 17, 17]))
     np.testing.assert_allclose(omega, np.tile([[0.3], [-1.0]], (4, 1, 1)), atol=1e-12)
     assert (residuals < 1e-12).all()
 
@@ -206,11 +214,11 @@ def test_slices_of_repeated_actions_are_exact():
     st.lists(st.tuples(st.integers(0, 29), st.integers(1, 30)), min_size=1),
 )
 def test_slices_fitted_together_are_fitted_each_about_its_mean(omega, stretches):
-    plan, n_rbf = action_plan(omega, 30), omega.shape[1]
+    plan, n_rbf = plan_of(omega, 30), omega.shape[1]
     firsts, lengths = np.array(stretches).T
     ends = np.minimum(firsts + lengths, 30)
-    for first, end, weights, residual in zip(firsts, ends, *fit_slices(plan, firsts, ends, n_rbf), strict=True):
-        actions, matrix = plan[first:end], basis_of_steps(end - first, n_rbf)
+    for first, end, weights, residual in zip(firsts, ends, *RadialBasis(n_rbf).fit(plan, firsts, ends), strict=True):
+        actions, matrix = plan[first:end], basis_of_steps(RadialBasis(n_rbf), end - first)
         mean = actions.mean(axis=0)
         expected = (mean + np.linalg.pinv(matrix) @ (actions - mean)).clip(-1, 1)
         np.testing.assert_allclose(weights, expected.T, atol=1e-9)
@@ -222,19 +230,19 @@ def test_a_fit_is_the_least_squares_one_and_says_how_far_off_it_is():
     p = 1 / (1 + math.exp(-8 / 3))
     # ω = (u, v) with pu + (1 − p)v = 0.4 and (u + v)/2 = 0.1
     v = (0.4 - 0.2 * p) / (1 - 2 * p)
-    [omega], [residual] = fit_slices(np.array([[0.4], [0.1]]), np.array([0]), np.array([2]), 2)
+    [omega], [residual] = RadialBasis(2).fit(np.array([[0.4], [0.1]]), np.array([0]), np.array([2]))
     np.testing.assert_allclose(omega, [[0.2 - v, v]], atol=1e-9)
     assert residual < 1e-9
     # A plan that leaves the box of the weights is clipped, and the deviation told.
-    [omega], [residual] = fit_slices(np.array([[1.0], [-1.0]]), np.array([0]), np.array([2]), 2)
+    [omega], [residual] = RadialBasis(2).fit(np.array([[1.0], [-1.0]]), np.array([0]), np.array([2]))
     assert np.abs(omega).max() <= 1.0
-    plan = action_plan(omega, 2)
+    plan = plan_of(omega, 2)
     assert residual == pytest.approx(np.abs(plan - [[1.0], [-1.0]]).max())
     assert residual > 0.05
 
 
 def test_encode_is_the_inverse_of_decode():
-    settings = OptionSettings(n_rbf=2, d_max=1.0, d_min=0.1, dt=0.1, discount_rate=0.4)
+    settings = OptionSpace.make(n_rbf=2, d_max=1.0, d_min=0.1, dt=0.1, discount_rate=0.4)
     omega = np.array([[0.1, 0.2], [-0.3, 0.4]])
     options = settings.encode(np.tile(omega, (10, 1, 1)), np.arange(1, 11))
     assert options.dtype == np.float32
@@ -242,5 +250,71 @@ def test_encode_is_the_inverse_of_decode():
         again, steps = settings.decode(option)
         np.testing.assert_allclose(again, omega, rtol=1e-6)
         assert steps == n_steps
-    fixed = OptionSettings(n_rbf=2, d_max=0.3, d_min=0.3, dt=0.1, discount_rate=0.4)
+    fixed = OptionSpace.make(n_rbf=2, d_max=0.3, d_min=0.3, dt=0.1, discount_rate=0.4)
     assert fixed.decode(fixed.encode(omega[None], np.array([3]))[0])[1] == 3
+
+
+# --- other trajectories, and durations on a logarithmic scale
+
+
+def test_a_bezier_curve_by_hand():
+    # Three control points: (1−x)², 2x(1−x), x² at x = 1/4.
+    np.testing.assert_allclose(BezierCurve(3).basis(np.array([0.25])), [[9 / 16, 6 / 16, 1 / 16]])
+    np.testing.assert_array_equal(BezierCurve(1).basis(np.array([0.0, 0.7])), [[1.0], [1.0]])
+    # It begins at its first weight. Four steps are at x = 0, 1/4, 1/2, 3/4.
+    plan = BezierCurve(2).plan(np.array([[1.0, -1.0]]), 4)
+    np.testing.assert_allclose(plan[:, 0], [1.0, 0.5, 0.0, -0.5])
+
+
+@pytest.mark.parametrize("kind", TRAJECTORIES.values())
+def test_a_stretch_of_a_plan_is_fitted_back(kind):
+    trajectory = kind(3)
+    omega = np.array([[0.5, -0.3, 0.9], [0.0, 0.2, -0.7]])
+    plan = trajectory.plan(omega, 30)
+    assert np.abs(plan).max() <= 0.9
+    fitted, residuals = trajectory.fit(plan, np.array([0, 10]), np.array([30, 20]))
+    np.testing.assert_allclose(fitted[0], omega, atol=1e-6)
+    np.testing.assert_allclose(trajectory.plan(fitted[1], 10), plan[10:20], atol=residuals[1] + 1e-12)
+    assert residuals[0] < 1e-6
+
+
+def test_a_logarithmic_duration_by_hand():
+    """Halfway is the geometric mean: 0.04 s to 0.64 s is a factor of 16, and 0.16 s is four times the shortest."""
+    space = OptionSpace.make(1, 0.64, 0.04, 0.02, 0.4, duration_scale="log")
+    for normalised, seconds in ((-1.0, 0.04), (-0.5, 0.08), (0.0, 0.16), (1.0, 0.64)):
+        assert space.duration(np.array([0.0, normalised])) == pytest.approx(seconds)
+    options = space.encode(np.zeros((3, 1, 1)), np.array([2, 4, 8]))
+    np.testing.assert_allclose(options[:, -1], [-1.0, -0.5, 0.0], atol=1e-6)
+    assert [space.decode(option)[1] for option in options.astype(np.float64)] == [2, 4, 8]
+
+
+def test_option_spaces_tell_their_arguments_and_differences():
+    space = OptionSpace.make(2, 0.5, 0.02, 0.01, 0.4, "bezier", "log")
+    assert OptionSpace.make(**space.arguments) == space
+    assert space.arguments["trajectory"] == "bezier"
+    other = OptionSpace.make(2, 0.5 * (1 + 1e-9), 0.03, 0.01, 0.4, "rbf", "log")
+    assert space.differences(other) == {"trajectory": ("bezier", "rbf"), "d_min": (0.02, 0.03)}
+    for arguments, message in (
+        ({"trajectory": "spline"}, "trajectory must be one of"),
+        ({"duration_scale": "x"}, "duration_scale"),
+    ):
+        with pytest.raises(ValueError, match=message):
+            OptionSpace.make(**{**space.arguments, **arguments})
+
+
+@pytest.mark.parametrize("kind", TRAJECTORIES.values())
+def test_canonical_weights_play_the_same_and_are_the_same_for_all_that_do(kind):
+    trajectory, rng = kind(3), np.random.default_rng(0)
+    matrices = trajectory.canonical()
+    for n_steps in (1, 2, 3, 4):
+        matrix = matrices[min(n_steps, 3) - 1]
+        omega = rng.uniform(-1, 1, (2, 3))
+        canonical = omega @ matrix.T
+        np.testing.assert_allclose(trajectory.plan(canonical, n_steps), trajectory.plan(omega, n_steps), atol=1e-9)
+        # Weights that differ in what nothing feels
+        felt = basis_of_steps(trajectory, n_steps)
+        free = np.eye(3) - np.linalg.pinv(felt) @ felt
+        np.testing.assert_allclose((omega + rng.normal(size=(2, 3)) @ free) @ matrix.T, canonical, atol=1e-9)
+    # One step: all weights are the action.
+    np.testing.assert_allclose(np.ptp((omega @ matrices[0].T), axis=1), 0.0, atol=1e-9)
+    np.testing.assert_array_equal(matrices[2], np.eye(3))

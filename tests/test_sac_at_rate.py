@@ -23,6 +23,19 @@ SMALL = {"policy_kwargs": {"net_arch": [8]}, "batch_size": 8, "device": "cpu", "
 # --- the wrapper
 
 
+def test_the_agents_reward_is_in_the_unit_of_gamma_dt(scripted_env):
+    """At ``gamma_dt`` rewards are as they are, as for stock SAC; half that time is worth a little more than half."""
+    for dt, expected in ((0.1, 3.0), (0.05, 3.0 / (1.0 + math.sqrt(0.9)))):
+        model = sac_at_rate(scripted_env(rewards=lambda step, action: 3.0, dt=dt), dt=dt, gamma=0.9, gamma_dt=0.1)
+        env = model.get_env()
+        env.reset()
+        _, rewards, _, infos = env.step(np.zeros((1, 1)))
+        assert rewards[0] == pytest.approx(expected)
+        # What is evaluated stays the integral: 3·(1 − 0.9^(dt/0.1))/τ.
+        tau = -math.log(0.9) / 0.1
+        assert infos[0]["option"]["integrated_reward"] == pytest.approx(3.0 * (1 - 0.9 ** (dt / 0.1)) / tau)
+
+
 def test_reward_rate_by_hand(scripted_env):
     """τ = ln 2 per second and steps of 1 s: a rate of r is worth r·(1 − ½)/ln 2."""
     env = RewardRateWrapper(scripted_env(rewards=lambda step, action: 3.0 + step), dt=1.0, discount_rate=math.log(2.0))
@@ -68,7 +81,7 @@ def test_a_step_is_an_option_of_one_step(dt, discount_rate, n_steps):
 
 
 def test_bad_wrapper_settings(scripted_env):
-    with pytest.raises(ValueError, match="pass dt, in seconds, to RewardRateWrapper"):
+    with pytest.raises(ValueError, match=r"pass dt, in seconds, .* or to RewardRateWrapper"):
         RewardRateWrapper(scripted_env(dt=None))
     with pytest.raises(ValueError, match="dt must be a positive"):
         RewardRateWrapper(scripted_env(), dt=0.0)
@@ -83,7 +96,7 @@ def test_bad_wrapper_settings(scripted_env):
 def test_the_wrapper_can_be_rebuilt_from_its_spec():
     env = RewardRateWrapper(gym.make("Pendulum-v1"), discount_rate=0.1)
     again = gym.make(env.spec)
-    assert again.option_settings == env.option_settings
+    assert again.option_space == env.option_space
 
 
 # --- the schedule of updates
@@ -125,7 +138,7 @@ def test_the_same_clock_at_every_dt(scripted_env, dt, gamma):
     assert type(model) is SAC
     assert model.gamma == pytest.approx(gamma)
     assert model.learning_starts == round(3.0 / dt)
-    one = model.get_env().get_attr("option_settings")[0]
+    one = model.get_env().get_attr("option_space")[0]
     assert (one.dt, one.discount_rate) == (dt, pytest.approx(DEFAULT_DISCOUNT_RATE))
     assert model.gradient_steps / model.train_freq.frequency == pytest.approx(20 * dt, rel=1e-3)
 

@@ -152,7 +152,7 @@ def test_predict(algorithm, random_walk_env):
     assert not np.array_equal(greedy, model.predict(one, deterministic=False)[0])
     options, _ = model.predict(several)
     assert options.shape == (4, *model.action_space.shape)
-    assert all(model.action_space.contains(option) for option in options)
+    assert all(model.action_space.contains(option.vector) for option in options)
     with pytest.raises(ValueError, match="Unexpected observation shape"):
         model.predict(np.zeros(7, np.float32))
 

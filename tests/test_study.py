@@ -5,6 +5,7 @@ import dataclasses
 import json
 import math
 import os
+import re
 import shutil
 import signal
 import subprocess
@@ -12,13 +13,15 @@ import sys
 import time
 from pathlib import Path
 
-import gymnasium as gym
 import matplotlib as mpl
 import numpy as np
 import pytest
 import yaml
+from conftest import PATIENCE
 from rliable.metrics import aggregate_iqm
 
+from sb3_ctco.registry import ALGORITHMS as ALGORITHM_ROWS
+from sb3_ctco.registry import TASKS, Task, find_task
 from sb3_ctco.study import agents, engines, plots, runs, status
 from sb3_ctco.study.cli import main
 from sb3_ctco.study.grid import Run, load_preset, preset_names
@@ -62,8 +65,8 @@ def few_resamples(monkeypatch):
     monkeypatch.setattr(plots, "_BOOTSTRAP_REPETITIONS", 50)
 
 
-def wait_for(condition, seconds: float = 60.0) -> None:
-    end = time.monotonic() + seconds
+def wait_for(condition) -> None:
+    end = time.monotonic() + PATIENCE
     while not condition():
         assert time.monotonic() < end, "it did not happen"
         time.sleep(0.02)
@@ -73,7 +76,7 @@ def wait_for(condition, seconds: float = 60.0) -> None:
 
 
 def test_the_presets_are_the_grids_that_they_should_be():
-    assert preset_names() == ["learning", "paper", "quick", "smoke"]
+    assert preset_names() == ["learning", "native", "paper", "quick", "smoke"]
     paper, quick = load_preset("paper"), load_preset("quick")
     assert len(paper.select(settings=["paper"])) == 30 * 4 * 3 * 4
     assert {run.task_seconds for run in paper.runs} == {400 * 60}
@@ -111,8 +114,9 @@ def test_seeds_may_be_others_than_the_presets() -> None:
 def test_every_setting_fits_its_constructor_and_environment(name):
     for run in load_preset(name).runs:
         agents.constructor_arguments(run)
-        assert gym.spec(run.env_id).kwargs["dt"] == pytest.approx(run.dt)
-        assert gym.spec(run.env_id).kwargs["time_limit"] == 10.0
+    for task, rate in {(run.task, run.rate) for run in load_preset(name).runs}:
+        spec = find_task(task).make_env(rate).spec
+        assert (spec.kwargs["dt"], spec.kwargs["time_limit"]) == (1 / rate, 10.0)
 
 
 @pytest.mark.parametrize("rate", [50, 500])
@@ -124,7 +128,7 @@ def test_seconds_become_steps(algorithm, rate):
     if algorithm in ("sac", "dac_ppo"):
         gamma = model.gamma if algorithm == "sac" else model.step_gamma
         assert gamma == pytest.approx(0.98 ** (1 / rate / 0.05))
-        assert model.get_env().get_attr("option_settings")[0].dt == pytest.approx(1 / rate)
+        assert model.get_env().get_attr("option_space")[0].dt == pytest.approx(1 / rate)
     if algorithm == "sac":
         assert model.gradient_steps / model.train_freq.frequency * rate == pytest.approx(20)
     else:
@@ -137,15 +141,43 @@ def test_seconds_become_steps(algorithm, rate):
     assert model.seed == 0
 
 
+def of_ctco(**changes):
+    return {"algorithms": {"ctco": {"setting": "a", "arguments": {}, **changes}}}
+
+
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
-        ({"tasks": ["walker"]}, r"tasks must be a list of some of .*'ball_in_cup'.* not \['walker'\]"),
-        ({"rates": [60]}, r"rates must be a list of some of \(50, 100, 250, 500\), each once, not \[60\]"),
+        ({"tasks": ["walker"]}, r"no task 'walker': name one of .*'ball_in_cup'\], or an id of Gymnasium's registry"),
+        ({"tasks": ["cheetah", "cheetah"]}, "tasks must be a list of tasks, each once, or a mapping"),
+        ({"tasks": {"cheetah": {"rate": 50}}}, r"task cheetah: \[\] missing, \['rate'\] unknown"),
+        ({"tasks": {"cheetah": {"evaluations": 0}}}, "task cheetah: evaluations must be a whole number from 1, not 0"),
+        ({"rates": [50.5]}, r"rates must be a list of whole numbers of Hz, each once, not \[50.5\]"),
         ({"seeds": 0}, "seeds must be a whole number from 1, not 0"),
         ({"task_seconds": 50}, "task_seconds must be at least 100, so that an episode of 10 s ends in the last tenth"),
         ({"step": 1}, r"\[\] missing, \['step'\] unknown"),
         ({"algorithms": {"ppo": {"setting": "a", "arguments": {}}}}, "must be one of .* not 'ppo'"),
+        ({"tasks": [{"cheetah": 1}]}, r"there is no task \{'cheetah': 1\}"),
+        ({"tasks": {"cheetah": {"arguments": [1]}}}, r"task cheetah: arguments must be a mapping .* not \[1\]"),
+        ({"seeds": True}, "seeds must be a whole number from 1, not True"),
+        ({"seeds": 1.0}, "seeds must be a whole number from 1, not 1.0"),
+        ({"eval_episodes": True}, "eval_episodes must be a whole number from 1, not True"),
+        ({"task_seconds": math.inf}, "task_seconds must be at least 100, .* and finite, not inf"),
+        ({"task_seconds": math.nan}, "task_seconds must be at least 100, .* and finite, not nan"),
+        ({"task_seconds": "long"}, "task_seconds must be at least 100, .* not 'long'"),
+        ({"algorithms": ["ctco"]}, r"algorithms must be a mapping of names to setting and arguments, not \['ctco'\]"),
+        ({"algorithms": {}}, "algorithms must be a mapping of names to setting and arguments, not {}"),
+        ({"algorithms": None}, "algorithms must be a mapping of names to setting and arguments, not None"),
+        ({"algorithms": {"ctco": None}}, r"algorithm ctco: must be a mapping with \['setting', 'arguments', 'algorithm'\]"),
+        (of_ctco(arguments=None), "arguments must be a mapping of names to values .* not None"),
+        (of_ctco(arguments=[1]), r"arguments must be a mapping of names to values .* not \[1\]"),
+        (of_ctco(arguments={3: 1}), r"arguments must be a mapping of names to values .* not \{3: 1\}"),
+        (of_ctco(algorithm=["ctco"]), r"must be one of .* not \['ctco'\]"),
+        (of_ctco(setting=None), "letters, digits and _ . . -, not None"),
+        (of_ctco(setting=""), "letters, digits and _ . . -, not ''"),
+        (of_ctco(setting="../../elsewhere"), "letters, digits and _ . . -, not '../../elsewhere'"),
+        (of_ctco(setting="/tmp"), "letters, digits and _ . . -, not '/tmp'"),
+        (of_ctco(setting=[1]), r"letters, digits and _ . . -, not \[1\]"),
     ],
 )
 def test_mistakes_in_a_preset(tmp_path, changes, message):
@@ -153,37 +185,52 @@ def test_mistakes_in_a_preset(tmp_path, changes, message):
         load_preset(tiny(tmp_path, **changes))
 
 
-@pytest.mark.parametrize("setting", ["../../../outside", "/tmp/outside", "a/b", "a\\b", "..", "a\0b", "", "a\nb", "naïve"])
-def test_a_setting_cannot_leave_the_studys_folder(tmp_path, setting, capsys):
-    entry = yaml.safe_load(Path(tiny(tmp_path)).read_text())["algorithms"]["ctco"]
-    preset = tiny(tmp_path, algorithms={"ctco": {**entry, "setting": setting}}, tasks=["point_mass"])
-    folder = tmp_path / "inner" / "study"
-    before = set(tmp_path.rglob("*"))
-    if setting in ("", ".."):
-        # Between other parts of a name these are harmless.
-        runs.plan(load_preset(preset).runs, folder)
-        assert {path.parent for path in folder.iterdir()} == {folder}
-        return
-    assert main(["run", "--preset", preset, "--folder", str(folder)]) == 1
-    assert f"setting {setting!r} of ctco would make the folder" in capsys.readouterr().err
-    assert set(tmp_path.rglob("*")) == before
-    (run, *_) = load_preset(preset).runs
-    with pytest.raises(ValueError, match="must consist of letters"):
-        runs.perform(run, folder)
-
-
-def test_a_preset_is_data_only(tmp_path):
-    file = tmp_path / "evil.yml"
-    file.write_text(f"task_seconds: !!python/object/apply:os.mkdir ['{tmp_path}/made']\n")
-    with pytest.raises(Exception, match="could not determine a constructor"):
+@pytest.mark.parametrize(
+    ("content", "message"),
+    [
+        (b"tasks: [point_mass", "preset broken is no YAML: .*line 1"),
+        (b"tasks: \xff", "preset broken is no YAML: "),
+        (b"tasks: 2026-13-45", "preset broken is no YAML: "),
+        (b"!!python/object/apply:os.system ['true']", "preset broken is no YAML: .*could not determine a constructor"),
+        (b"", "preset broken: must be a mapping with .* not None"),
+        (b"{1: 2, step: 1}", r"preset broken: \['algorithms', .*\] missing, \[1, 'step'\] unknown"),
+        (b"[1, 2]", r"preset broken: must be a mapping with .* not \[1, 2\]"),
+    ],
+)
+def test_files_that_are_no_presets(tmp_path, content, message):
+    file = tmp_path / "broken.yml"
+    file.write_bytes(content)
+    with pytest.raises(ValueError, match=re.compile(message, re.DOTALL)):
         load_preset(str(file))
-    assert not (tmp_path / "made").exists()
+
+
+def test_folders_that_cannot_be_a_study(tmp_path, capsys):
+    preset, file = tiny(tmp_path), tmp_path / "file"
+    file.write_text("not a folder")
+    for arguments, message in [
+        (["run", "--preset", preset, "--folder", str(file)], "Not a directory"),
+        (["run", "--preset", preset, "--folder", str(file / "inside")], "Not a directory"),
+        (["run", "--preset", preset, "--folder", "/proc/nothing"], "/proc/nothing cannot be the study's folder: "),
+        (["run", "--preset", str(tmp_path)], "there is no preset"),
+        (["status", str(file)], "is no folder of a study"),
+        (["collect", str(tmp_path / "none"), "--into", str(tmp_path / "a.csv")], "there is no folder or CSV file"),
+    ]:
+        assert main(arguments) == 1, arguments
+        assert message in capsys.readouterr().err
+    settings = tmp_path / "study" / load_preset(preset).runs[0].name / "settings.json"
+    settings.parent.mkdir(parents=True)
+    settings.write_text('{"preset": ')
+    assert main(["run", "--preset", preset, "--folder", str(tmp_path / "study")]) == 1
+    assert f"{settings} is damaged" in capsys.readouterr().err
 
 
 def test_mistakes_on_the_command_line(tmp_path, capsys):
     preset = tiny(tmp_path, algorithms={"ctco": {"setting": "a", "arguments": {"gama": 0.9}}})
     for arguments, message in [
-        (["run", "--preset", "none"], "no preset 'none': name one of ['learning', 'paper', 'quick', 'smoke'], or a YAML file"),
+        (
+            ["run", "--preset", "none"],
+            "no preset 'none': name one of ['learning', 'native', 'paper', 'quick', 'smoke'], or a YAML file",
+        ),
         (["run", "--preset", "quick", "--rates", "60"], "preset quick has no rate [60]; it has [50, 100, 250, 500]"),
         (["run", "--preset", preset], "ctco (a) has no arguments ['gama']"),
         (["run", "--preset", preset, "--workers", "0"], "--workers must be at least 1, not 0"),
@@ -291,11 +338,12 @@ def test_two_studies_on_one_folder(finished, tmp_path, capsys):
     assert not runs.is_running(first)
 
 
+@pytest.mark.slow
 def test_two_studies_at_once_make_each_run_once(tmp_path):
     preset, folder = tiny(tmp_path, seeds=3), tmp_path / "study"
     arguments = [*COMMAND, "run", "--preset", preset, "--folder", str(folder), "--workers", "1"]
     studies = [subprocess.Popen(arguments, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True) for _ in range(2)]
-    outputs = [study.communicate(timeout=120)[0] for study in studies]
+    outputs = [study.communicate(timeout=PATIENCE)[0] for study in studies]
     assert {study.returncode for study in studies} <= {0, 3}, outputs
     assert len(list(folder.glob("*/record.json"))) == 3
     for file in folder.glob("*/monitor.csv"):
@@ -304,6 +352,7 @@ def test_two_studies_at_once_make_each_run_once(tmp_path):
         assert len(seconds) == 10
 
 
+@pytest.mark.slow
 def test_kill_9_loses_only_the_runs_in_flight(tmp_path):
     preset, folder = tiny(tmp_path, seeds=6), tmp_path / "study"
     arguments = ["run", "--preset", preset, "--folder", str(folder), "--workers", "2"]
@@ -333,7 +382,7 @@ def test_a_study_shares_no_memory_and_no_semaphores(tmp_path):
     study = subprocess.Popen(arguments, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
     worker = worker_at_work(study.pid, folder)
     used = {path for pid in (study.pid, worker) for path in mapped_files(pid) | open_files(pid) if "/dev/shm" in path}
-    assert study.wait(timeout=120) == 0
+    assert study.wait(timeout=PATIENCE) == 0
     assert used == set()
 
 
@@ -371,12 +420,13 @@ def dies(connection, folder):
     os._exit(7)
 
 
+@pytest.mark.slow
 def test_a_worker_that_dies_is_replaced(tmp_path):
     preset, folder = tiny(tmp_path, seeds=4), tmp_path / "study"
     arguments = ["run", "--preset", preset, "--folder", str(folder), "--workers", "2"]
     study = subprocess.Popen([*COMMAND, *arguments], stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
     os.kill(worker_at_work(study.pid, folder), signal.SIGKILL)
-    assert study.wait(timeout=120) == 0
+    assert study.wait(timeout=PATIENCE) == 0
     assert len(list(folder.glob("*/record.json"))) == 4
 
 
@@ -387,7 +437,7 @@ def test_ray_ends_a_study_although_a_worker_is_killed(tmp_path):
     arguments = ["run", "--preset", preset, "--folder", str(folder), "--workers", "2", "--engine", "ray"]
     study = subprocess.Popen([*COMMAND, *arguments], stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
     os.kill(worker_at_work(study.pid, folder), signal.SIGKILL)
-    assert study.wait(timeout=120) == 0
+    assert study.wait(timeout=PATIENCE) == 0
     assert len(list(folder.glob("*/record.json"))) == 3
 
 
@@ -425,6 +475,42 @@ def open_files(pid: int) -> set[str]:
 # --- records and figures
 
 
+def test_a_native_task_runs_at_its_own_rate(tmp_path):
+    """Any Gymnasium id, and its plain sum of rewards beside the discounted return."""
+    arguments = {"gamma": 0.99, "gamma_dt": 0.05, "updates_per_second": 0.1, "learning_starts_seconds": 20, "batch_size": 8}
+    preset = tiny(
+        tmp_path,
+        tasks={"Pendulum-v1": {"rates": [20], "evaluations": 2, "arguments": arguments}},
+        algorithms={name: {"setting": "small", "arguments": {}} for name in ("ctco", "sac")},
+        seeds=1,
+    )
+    assert main(["run", "--preset", preset, "--folder", str(tmp_path / "study"), "--workers", "1"]) == 0
+    records = read_records(tmp_path / "study")
+    assert [record["algorithm"] for record in records] == ["ctco", "sac"]
+    for record in records:
+        assert record["dt"] == 0.05
+        assert -2000 < record["greedy_episode_return"] < -500
+        # A reward of r all the time is worth 200·r in sum, and (1 − e^(−10τ))/τ·r = 4.3·r discounted.
+        assert 4.3 / 200 * 0.3 < record["greedy_return"] / record["greedy_episode_return"] < 4.3 / 200 * 3
+    rows = list(csv.DictReader((tmp_path / "study" / "Pendulum-v1-sac_small-20hz-seed0" / "evaluation.csv").open()))
+    assert [float(row["task_seconds"]) for row in rows] == pytest.approx([95, 100])
+    with pytest.raises(ValueError, match="task Pendulum-v1 runs at 20 Hz, not at 50 Hz"):
+        find_task("Pendulum-v1").make_env(50)
+
+
+def test_a_row_makes_an_algorithm_and_a_task_part_of_a_study(tmp_path, monkeypatch):
+    row = dataclasses.replace(ALGORITHM_ROWS["ctco"], name="dummy", label="a dummy", colour="C7")
+    monkeypatch.setitem(ALGORITHM_ROWS, "dummy", row)
+    monkeypatch.setitem(TASKS, "swing", Task("swing", "a swing", "sb3_ctco/pendulum-swingup-v0"))
+    arguments = yaml.safe_load(Path(tiny(tmp_path)).read_text())["algorithms"]["ctco"]
+    preset = tiny(tmp_path, tasks=["swing"], rates=[25], algorithms={"dummy": arguments}, seeds=1)
+    (run,) = load_preset(preset).runs
+    runs.plan([run], tmp_path / "study")
+    assert runs.perform(run, tmp_path / "study").state == "done"
+    assert main(["plot", str(tmp_path / "study")]) == 0
+    assert "| a swing | a dummy | small |" in (tmp_path / "study" / "figures" / "table.md").read_text()
+
+
 def synthetic(n_seeds: int = 2) -> list[dict]:
     """Records whose returns are the paper's, ±0.1 with the seeds 0 and 1; CTCO with two settings."""
     records = []
@@ -434,6 +520,8 @@ def synthetic(n_seeds: int = 2) -> list[dict]:
         rate = 3.0 if run.algorithm == "ctco" else float(run.rate)
         made = {"discounted_return": value, "greedy_return": value + 0.2, "decision_rate_hz": rate}
         made |= {
+            "episode_return": 50 * value,
+            "greedy_episode_return": 50 * value,
             "greedy_decision_rate_hz": rate,
             "updates": 48000,
             "wall_seconds": 100.0,
@@ -503,7 +591,8 @@ def test_the_figure_shows_the_records_and_the_paper():
     for ax, task in zip(figure.axes, ("point_mass", "cheetah", "ball_in_cup"), strict=True):
         lines = {line.get_label(): line for line in ax.get_lines()}
         assert ax.get_xscale() == "log"
-        for algorithm, name in plots.ALGORITHM_NAMES.items():
+        for algorithm, row in ALGORITHM_ROWS.items():
+            name = row.label
             numbers = paper_returns()[task, algorithm]
             setting = "tuned" if algorithm == "ctco" else "large"
             for label in (f"{name} ({setting})", f"{name}, the paper's figure"):

@@ -7,11 +7,21 @@ import gymnasium as gym
 import numpy as np
 import pytest
 from gymnasium.error import ResetNeeded
+from gymnasium.utils.env_checker import check_env as gymnasium_check_env
+from gymnasium.wrappers import FlattenObservation, TransformObservation
+from stable_baselines3 import SAC
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.monitor import Monitor
-from stable_baselines3.common.vec_env import SubprocVecEnv, VecFrameStack
+from stable_baselines3.common.vec_env import (
+    DummyVecEnv,
+    SubprocVecEnv,
+    VecEnvWrapper,
+    VecExtractDictObs,
+    VecFrameStack,
+    VecNormalize,
+)
 
-from sb3_ctco import CTCO, OptionExecutionWrapper
+from sb3_ctco import CTCO, DictOptionReplayBuffer, OptionExecutionWrapper, OptionReplayBuffer
 from sb3_ctco.options import discount, integrated_reward, step_weight
 
 TAU = math.log(2.0)
@@ -57,7 +67,7 @@ def test_accounting_equals_running_the_stretch(scripted_env, end, unit):
             seen_at_end += bool(sub.terminated[i] or sub.truncated[i])
             lengths += last - first
             # What the option vector stands for: the duration, and the actions within the residual
-            settings = env.option_settings
+            settings = env.option_space
             omega, n_steps = settings.decode(sub.options[i])
             assert n_steps == last - first
             plan = env.plan(sub.options[i])
@@ -150,14 +160,30 @@ def test_an_observation_on_the_way_that_is_not_finite_is_refused(scripted_env):
     env.step(np.append(np.zeros(3), 1.0))
 
 
-def test_an_environments_own_infos_stay(scripted_env):
+@pytest.mark.parametrize("n_sub_options", [0, 8])
+def test_an_environments_own_infos_stay(scripted_env, n_sub_options):
     class Env(scripted_env):
         def step(self, action):
             return *super().step(action)[:4], {"observations": "its own"}
 
-    env = wrap(Env(), n_sub_options=0)
+    env = wrap(Env(), n_sub_options=n_sub_options)
     env.reset(seed=0)
-    assert env.step(np.append(np.zeros(3), 1.0))[4]["observations"] == "its own"
+    info = env.step(np.append(np.zeros(3), 1.0))[4]
+    assert info["observations"] == "its own"
+    assert len(info.get("sub_options", [])) >= n_sub_options / 2
+    assert set(info) <= {"observations", "option", "sub_options"}
+
+
+@pytest.mark.parametrize("kind", ["vector", "dict"])
+def test_equal_if_all_fields_are(random_walk_env, kind):
+    """Checkers of environments compare infos."""
+    env = wrap(random_walk_env(kind))
+    gymnasium_check_env(env, skip_render_check=True)
+    (one, *_), (same, *_) = next(play(env)), next(play(env))
+    (_, *_), (other, *_) = itertools.islice(play(env), 2)
+    assert one == same
+    assert one != other
+    assert one != "no sub-options"
 
 
 def test_they_change_nothing_in_what_the_environment_does():
@@ -293,6 +319,98 @@ def test_images_that_sb3_transposes(random_walk_env):
     assert images.shape[1:] == (3, 36, 36)
     assert (images[:, 0] == 7).all()
     assert buffer.pos > 20
+
+
+class ChannelsLast(gym.ObservationWrapper):
+    """Images in which each pixel is another, and that change with the state."""
+
+    dt = 0.1
+
+    def __init__(self, env):
+        super().__init__(env)
+        image = gym.spaces.Box(0, 255, (36, 40, 3), np.uint8)
+        self.observation_space = gym.spaces.Dict({"a": image}) if env.kind == "dict" else image
+
+    def observation(self, obs):
+        image = np.arange(36 * 40 * 3).reshape(36, 40, 3)
+        image = ((image + self.env.count * 7) % 256).astype(np.uint8)
+        return {"a": image} if self.env.kind == "dict" else image
+
+
+@pytest.mark.parametrize("kind", ["image", "dict"])
+@pytest.mark.parametrize("algorithm", ["SAC", "CTCO"])
+def test_images_with_channels_last_are_transposed_and_not_reshaped(random_walk_env, kind, algorithm):
+    env = OptionExecutionWrapper(ChannelsLast(random_walk_env(kind)), n_rbf=3, d_max=1.0, n_sub_options=4)
+    policy = "CnnPolicy" if kind == "image" else "MultiInputPolicy"
+    if algorithm == "SAC":
+        buffer_class = OptionReplayBuffer if kind == "image" else DictOptionReplayBuffer
+        model = SAC(policy, env, replay_buffer_class=buffer_class, buffer_size=200, learning_starts=10**9)
+        model.learn(20)
+    else:
+        model = make(env, policy, buffer_size=200, d_max=1.0).learn(100)
+    buffer = model.replay_buffer
+    assert buffer.pos > 1.5 * buffer.n_decisions
+    for stored in (buffer.observations, buffer.next_observations):
+        images = stored["a"] if kind == "dict" else stored
+        for image in images[: buffer.pos, 0].astype(int):
+            # Down a channel a pixel differs from its neighbour by 3, and the channels from each other by 1.
+            assert image.shape == (3, 36, 40)
+            assert (np.diff(image, axis=2) % 256 == 3).all()
+            assert (np.diff(image, axis=0) % 256 == 1).all()
+
+
+def shifted(env):
+    return TransformObservation(env, lambda obs: obs + 1000, gym.spaces.Box(-np.inf, np.inf, env.observation_space.shape))
+
+
+class Shifted(VecEnvWrapper):
+    def reset(self):
+        return self.venv.reset() + 1000
+
+    def step_wait(self):
+        obs, *rest = self.venv.step_wait()
+        return obs + 1000, *rest
+
+
+def wrapped(env):
+    return OptionExecutionWrapper(env, n_rbf=3, d_max=1.0, n_sub_options=4)
+
+
+@pytest.mark.parametrize(
+    "outside",
+    [
+        lambda env: shifted(wrapped(env())),
+        lambda env: FlattenObservation(wrapped(env("dict"))),
+        lambda env: VecExtractDictObs(DummyVecEnv([lambda: wrapped(env("dict"))]), "vector"),
+        lambda env: Shifted(DummyVecEnv([lambda: wrapped(env())])),
+        lambda env: VecNormalize(DummyVecEnv([lambda: shifted(wrapped(env()))]), norm_reward=False),
+    ],
+    ids=["TransformObservation", "FlattenObservation", "VecExtractDictObs", "VecEnvWrapper", "below VecNormalize"],
+)
+def test_observations_changed_outside_are_refused(random_walk_env, outside):
+    env = outside(random_walk_env)
+    model = make(env, d_max=1.0, buffer_size=500)
+    with pytest.raises(ValueError, match=r"put wrappers that change observations inside, .*or pass n_sub_options=0"):
+        model.learn(100)
+    assert model.replay_buffer.size() == 0
+    make(env, d_max=1.0, n_sub_options=0, buffer_size=500).learn(100)
+
+
+def test_observations_changed_inside_reach_the_buffer(random_walk_env):
+    model = make(wrapped(shifted(random_walk_env())), d_max=1.0).learn(100)
+    stored = model.replay_buffer.observations[: model.replay_buffer.pos, 0]
+    assert len(stored) > 1.5 * model.replay_buffer.n_decisions
+    assert ((stored >= 999) & (stored <= 1001)).all()
+
+
+def test_vec_normalize_keeps_the_originals(random_walk_env):
+    """Of observations; those at an episode's end Stable-Baselines3 works back, which is not exact."""
+    env = VecNormalize(DummyVecEnv([lambda: wrapped(random_walk_env())]), norm_reward=False)
+    buffer = make(env, d_max=1.0).learn(300).replay_buffer
+    rows = slice(0, buffer.pos)
+    assert buffer.pos > 1.5 * buffer.n_decisions
+    first, last = buffer.observations[rows, 0, 1] * 20, buffer.next_observations[rows, 0, 1] * 20
+    np.testing.assert_allclose(last - first, buffer.durations[rows, 0] / 0.1, atol=1e-3)
 
 
 def test_the_ring_goes_round(random_walk_env):

@@ -8,8 +8,10 @@ from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.vec_env import SubprocVecEnv, VecNormalize
 
-from sb3_ctco import CTCO, OptionExecutionWrapper
+from sb3_ctco import CTCO, FiGARSAC, OptionExecutionWrapper
+from sb3_ctco.common.evaluation import DiscountedReturnCallback, evaluate_discounted_return
 from sb3_ctco.common.vec_env import AsyncOptionVecEnv
+from sb3_ctco.figar_sac.policies import decode_repetitions
 
 WRAPPER = {"n_rbf": 2, "d_max": 1.0}
 
@@ -175,6 +177,78 @@ def test_rows_are_what_an_environment_of_its_own_does(make_slow_env):
         assert truncated == buffer.dones[row, 0] == buffer.timeouts[row, 0]
         options += 1
     assert options == len(model._durations_since_log) > 40
+
+
+@pytest.mark.parametrize("min_ready", [1, 3])
+def test_figar_sac_stores_the_repetitions_that_ran(random_walk_env, min_ready):
+    """Of pending options nothing, and of those that the episode's end cut short what they became."""
+    env = make_vec_env(
+        random_walk_env,
+        n_envs=3,
+        seed=0,
+        wrapper_class=OptionExecutionWrapper,
+        wrapper_kwargs={"n_rbf": 1, "d_max": 1.2},
+        vec_env_cls=AsyncOptionVecEnv,
+        vec_env_kwargs={"start_method": "fork", "min_ready": min_ready},
+    )
+    model = FiGARSAC("MlpPolicy", env, n_repetitions=12, learning_starts=200, gradient_steps=1, seed=0).learn(600)
+    env.close()
+    buffer = model.replay_buffer
+    rows = slice(0, buffer.pos)
+    repetitions = decode_repetitions(buffer.actions[rows, 0, -1], 12)
+    np.testing.assert_allclose(repetitions, buffer.durations[rows, 0] / 0.1, atol=1e-4)
+    # Nothing of what was pending: all that ran is in the buffer once.
+    assert round(repetitions.sum()) == model.num_timesteps
+    assert buffer.dones[rows].sum() > 5
+
+
+def test_evaluation_counts_options_once(slow_and_fast):
+    env, _ = slow_and_fast
+
+    class Policy:
+        """Environment 0 plays options of ten steps, 1 of one step."""
+
+        def predict(self, observation, **kwargs):
+            return np.stack([option(0.25, 1.0), option(-0.5, -1.0)]), None
+
+    episodes = evaluate_discounted_return(Policy(), env, 4, smoothness=True)
+    assert all(episode.seconds == pytest.approx(2.0) for episode in episodes)
+    assert {episode.decisions for episode in episodes} <= {2, 20}
+    # Each of these options is a constant action, and the same as the one before.
+    assert all(episode.mean_absolute_jerk == pytest.approx(0.0, abs=1e-6) for episode in episodes)
+
+
+def test_the_callback_of_discounted_returns_counts_options_once(random_walk_env):
+    env = make_env(random_walk_env, 3)
+    callback = DiscountedReturnCallback()
+    model = make_model(env, n_sub_options=0).learn(300, callback)
+    env.close()
+    assert all(episode.seconds == pytest.approx(2.0) for episode in callback.episodes)
+    assert model._episode_num - 1 <= len(callback.episodes) <= model._episode_num
+
+
+@pytest.mark.parametrize("n_envs", [1, 2])
+def test_the_callers_actions_stay_as_they_are(random_walk_env, n_envs):
+    env = make_env(random_walk_env, n_envs)
+    model = make_model(env, n_sub_options=0)
+    model.learn(0)
+    actions = np.full((n_envs, 3), 0.9, dtype=np.float32)
+    infos = [
+        {
+            "option": {
+                "duration": 0.1,
+                "n_steps": 1,
+                "integrated_reward": 0.0,
+                "discount": np.exp(-0.1 * model.discount_rate),
+            },
+            "played": np.full(3, 0.1, dtype=np.float32),
+        }
+        for _ in range(n_envs)
+    ]
+    model._store_transition(model.replay_buffer, actions, env.reset(), np.zeros(n_envs), np.zeros(n_envs, dtype=bool), infos)
+    env.close()
+    assert (actions == np.float32(0.9)).all()
+    np.testing.assert_allclose(model.replay_buffer.actions[:n_envs], 0.1, rtol=1e-6)
 
 
 def test_waiting_for_all_is_the_synchronous_one(random_walk_env):

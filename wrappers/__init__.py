@@ -1,9 +1,11 @@
 """Gymnasium wrappers of sb3-ctco."""
 
-from sb3_ctco.wrappers.option_execution import OptionExecutionWrapper, SubOptions, SupportsStepSequence, find_dt
+from sb3_ctco.wrappers.option_execution import OptionExecutionWrapper
 from sb3_ctco.wrappers.real_time import Clock, RealTimeWrapper, SupportsSendReceive, WallClock
 from sb3_ctco.wrappers.real_time_options import Interrupt, RealTimeOptionWrapper
 from sb3_ctco.wrappers.reward_rate import RewardRateWrapper
+from sb3_ctco.wrappers.step_sequence import SupportsStepSequence
+from sb3_ctco.wrappers.timing import find_dt
 
 __all__ = [
     "Clock",
@@ -12,7 +14,6 @@ __all__ = [
     "RealTimeOptionWrapper",
     "RealTimeWrapper",
     "RewardRateWrapper",
-    "SubOptions",
     "SupportsSendReceive",
     "SupportsStepSequence",
     "WallClock",

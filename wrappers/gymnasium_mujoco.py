@@ -37,14 +37,15 @@ def find_rollout(env: Any) -> Callable[..., tuple[Any, np.ndarray, bool, bool, d
 
     def roll_out(actions: np.ndarray, warmstart: np.ndarray) -> np.ndarray:
         """The joints' positions and velocities after each step from ``start``, ``[n_steps, nq + nv]``."""
-        ctrl = np.repeat(actions.astype(np.float64)[None], env.frame_skip, axis=1)
-        n_frames = ctrl.shape[1]
+        inputs = rollout_inputs(model, data, actions, env.frame_skip)
+        n_frames = inputs.shape[1]
         states, sensors = np.empty((1, n_frames, start.shape[1])), np.empty((1, n_frames, model.nsensordata))
         rollout.rollout(
             [model],
             [data],
             start,
-            ctrl,
+            inputs,
+            control_spec=int(mujoco.mjtState.mjSTATE_USER),
             skip_checks=True,
             nstep=n_frames,
             initial_warmstart=warmstart,
@@ -78,6 +79,26 @@ def find_rollout(env: Any) -> Callable[..., tuple[Any, np.ndarray, bool, bool, d
         return obs, np.append(rewards, reward), terminated, truncated, info
 
     return step_sequence
+
+
+def rollout_inputs(model: Any, data: Any, actions: np.ndarray, n_frames: int) -> np.ndarray:
+    """What ``mujoco.rollout`` is to set before each frame: actions, and all else that is a user's as it stands.
+
+    That is external forces (``xfrc_applied``, ``qfrc_applied``), mocap bodies, which equalities are active, and user
+    data: mujoco.rollout resets what it is not given.
+
+    :param actions: ``[n_steps, nu]``
+    :param n_frames: how many frames of the simulation a step has
+    :return: ``[1, n_steps · n_frames, size of mjSTATE_USER]``, which begins with the actions
+    """
+    import mujoco  # noqa: PLC0415 (who has a model has loaded it)
+
+    user = int(mujoco.mjtState.mjSTATE_USER)
+    inputs = np.empty(mujoco.mj_stateSize(model, user))
+    mujoco.mj_getState(model, data, inputs, user)
+    inputs = np.tile(inputs, (1, len(actions) * n_frames, 1))
+    inputs[0, :, : model.nu] = np.repeat(actions, n_frames, axis=0)
+    return inputs
 
 
 def _is_healthy(env: gym.Env, joints: np.ndarray) -> np.ndarray:

@@ -9,7 +9,8 @@ from typing import Any, Protocol, SupportsFloat, runtime_checkable
 import gymnasium as gym
 from gymnasium.utils import RecordConstructorArgs
 
-from sb3_ctco.wrappers.option_execution import find_dt
+from sb3_ctco.wrappers.checks import reset_env
+from sb3_ctco.wrappers.timing import find_dt
 
 logger = logging.getLogger(__name__)
 
@@ -95,13 +96,7 @@ class RealTimeWrapper(gym.Wrapper, RecordConstructorArgs):
     def __init__(self, env: gym.Env, dt: float | None = None, clock: Clock | None = None, tolerance: float = 1e-3):
         RecordConstructorArgs.__init__(self, dt=dt, clock=clock, tolerance=tolerance, _disable_deepcopy=True)
         gym.Wrapper.__init__(self, env)
-        if dt is None:
-            dt = find_dt(env)
-        if dt is None:
-            raise ValueError(
-                f"{env} does not tell its interaction period (no unwrapped.dt, control_timestep() or "
-                "metadata['render_fps']): pass dt, in seconds, to RealTimeWrapper"
-            )
+        dt = find_dt(env, required_by="RealTimeWrapper") if dt is None else dt
         if not (dt > 0 and math.isfinite(dt)):
             raise ValueError(f"dt must be a positive number of seconds, not {dt}")
         if not tolerance >= 0:
@@ -121,7 +116,7 @@ class RealTimeWrapper(gym.Wrapper, RecordConstructorArgs):
         self._log()
         self.statistics = TickStatistics()
         self._due = None
-        return self.env.reset(seed=seed, options=options)
+        return reset_env(self.env, seed, options)
 
     def step(self, action: Any) -> tuple[Any, SupportsFloat, bool, bool, dict[str, Any]]:
         """Send a command and return what is observed one period later."""

@@ -9,7 +9,8 @@ import numpy as np
 from gymnasium.error import ResetNeeded
 from gymnasium.utils import RecordConstructorArgs
 
-from sb3_ctco.wrappers.option_execution import OptionExecutionWrapper, SequenceResult, StepSequence
+from sb3_ctco.wrappers.option_execution import OptionExecutionWrapper
+from sb3_ctco.wrappers.step_sequence import SequenceResult, StepSequence
 
 #: ``interrupt(observation of the last decision, observation, seconds since that one)``: whether to end the option
 Interrupt = Callable[[Any, Any, float], bool]
@@ -50,12 +51,12 @@ class RealTimeOptionWrapper(OptionExecutionWrapper):
             self, decide_ahead=decide_ahead, interrupt=interrupt, background=background, _disable_deepcopy=True, **kwargs
         )
         super().__init__(env, **kwargs)
-        if not 0.0 <= decide_ahead < self.option_settings.d_max:
+        if not 0.0 <= decide_ahead < self.option_space.d_max:
             raise ValueError(
-                f"decide_ahead must be at least 0 s and less than d_max={self.option_settings.d_max} s, not {decide_ahead}"
+                f"decide_ahead must be at least 0 s and less than d_max={self.option_space.d_max} s, not {decide_ahead}"
             )
         self.interrupt = interrupt
-        self._ahead_steps = round(decide_ahead / self.option_settings.dt)
+        self._ahead_steps = round(decide_ahead / self.option_space.dt)
         self._executor = ThreadPoolExecutor(1, thread_name_prefix="option") if background else None
         self._rest: np.ndarray | None = None
         self._playing_rest: Future[SequenceResult] | None = None
@@ -80,17 +81,12 @@ class RealTimeOptionWrapper(OptionExecutionWrapper):
         cls, wrapper: OptionExecutionWrapper, decide_ahead: float, interrupt: Interrupt | None, background: bool
     ) -> "RealTimeOptionWrapper":
         """The same wrapper around the same environment, with what this class adds, and without sub-options."""
-        settings = wrapper.option_settings
         return cls(
             wrapper.env,
             decide_ahead,
             interrupt,
             background,
-            n_rbf=settings.n_rbf,
-            d_max=settings.d_max,
-            d_min=settings.d_min,
-            dt=settings.dt,
-            discount_rate=settings.discount_rate,
+            **wrapper.option_space.arguments,
             reward=wrapper.reward,
             reward_unit=wrapper.reward_unit,
         )
@@ -101,8 +97,10 @@ class RealTimeOptionWrapper(OptionExecutionWrapper):
         self._abandoned = False
         obs, info = super().reset(seed=seed, options=options)
         self._decided_on = obs
-        self._play = self._play_around_decisions
         return obs, info
+
+    def _choose_play(self) -> StepSequence:
+        return self._play_around_decisions
 
     def abandon(self) -> None:
         """Stop playing, at the next primitive step; needs a reset then."""
@@ -156,7 +154,7 @@ class RealTimeOptionWrapper(OptionExecutionWrapper):
             if terminated or truncated:
                 break
             if self.interrupt is not None and self.interrupt(
-                self._decided_on, obs, (steps_before + len(rewards)) * self.option_settings.dt
+                self._decided_on, obs, (steps_before + len(rewards)) * self.option_space.dt
             ):
                 info = {**info, "interrupted": True}
                 break

@@ -6,8 +6,9 @@ import gymnasium as gym
 import numpy as np
 from gymnasium.utils import RecordConstructorArgs
 
-from sb3_ctco.options import DEFAULT_DISCOUNT_RATE, OptionSettings, discount, step_weight
-from sb3_ctco.wrappers.option_execution import find_dt
+from sb3_ctco.options import DEFAULT_DISCOUNT_RATE, OptionSpace, discount, step_weight
+from sb3_ctco.wrappers.checks import check_observation, reset_env
+from sb3_ctco.wrappers.timing import find_dt
 
 
 class RewardRateWrapper(gym.Wrapper, RecordConstructorArgs):
@@ -30,37 +31,47 @@ class RewardRateWrapper(gym.Wrapper, RecordConstructorArgs):
     :param env: the environment to wrap
     :param dt: the interaction period, in s; by default what :func:`~sb3_ctco.wrappers.find_dt` finds
     :param discount_rate: τ, in 1/s; by default the paper's 0.404 (a factor of 0.98 over 0.05 s)
+    :param reward_scale: what rewards are multiplied by, too, for the agent alone: ``info["option"]`` tells the integral
     :raises ValueError: if a setting is out of range, or dt is not given and not found
     """
 
-    def __init__(self, env: gym.Env, dt: float | None = None, discount_rate: float = DEFAULT_DISCOUNT_RATE):
-        RecordConstructorArgs.__init__(self, dt=dt, discount_rate=discount_rate)
+    def __init__(
+        self,
+        env: gym.Env,
+        dt: float | None = None,
+        discount_rate: float = DEFAULT_DISCOUNT_RATE,
+        reward_scale: float = 1.0,
+    ):
+        RecordConstructorArgs.__init__(self, dt=dt, discount_rate=discount_rate, reward_scale=reward_scale)
         gym.Wrapper.__init__(self, env)
-        if dt is None:
-            dt = find_dt(env)
-        if dt is None:
-            raise ValueError(
-                f"{env} does not tell its interaction period (no unwrapped.dt, control_timestep() or "
-                "metadata['render_fps']): pass dt, in seconds, to RewardRateWrapper"
-            )
+        dt = find_dt(env, required_by="RewardRateWrapper") if dt is None else dt
         #: The clock: a step as an option of one step
-        self.option_settings = OptionSettings(n_rbf=1, d_max=dt, d_min=dt, dt=dt, discount_rate=discount_rate)
+        self.option_space = OptionSpace.make(1, d_max=dt, d_min=dt, dt=dt, discount_rate=discount_rate)
+        self.reward_scale = reward_scale
         self._weight = step_weight(dt, discount_rate)
         self._discount = float(discount(dt, discount_rate))
+
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
+        """Reset the inner environment.
+
+        :raises ValueError: if the observation is not finite, or not as its space says
+        """
+        return reset_env(self.env, seed, options)
 
     def step(self, action: Any) -> tuple[Any, SupportsFloat, bool, bool, dict[str, Any]]:
         """Step the inner environment, and weigh its reward.
 
-        :raises ValueError: if the reward is not finite
+        :raises ValueError: if the reward or the observation is not finite
         """
         obs, reward, terminated, truncated, info = self.env.step(action)
         integral = float(reward) * self._weight
         if not np.isfinite(integral):
             raise ValueError(f"the environment {self.env} returned a reward that is not finite: {reward}")
+        check_observation(self.env, obs)
         info["option"] = {
-            "duration": self.option_settings.dt,
+            "duration": self.option_space.dt,
             "n_steps": 1,
             "integrated_reward": integral,
             "discount": self._discount,
         }
-        return obs, integral, terminated, truncated, info
+        return obs, integral * self.reward_scale, terminated, truncated, info

@@ -1,5 +1,6 @@
 """Replay buffers for options: Stable-Baselines3's, extended by the duration and the integrated reward of a decision."""
 
+import dataclasses
 from typing import Any
 
 import numpy as np
@@ -10,12 +11,14 @@ from stable_baselines3.common.type_aliases import DictReplayBufferSamples, Repla
 from stable_baselines3.common.vec_env import VecNormalize
 
 from sb3_ctco.common.vec_env import PENDING
-from sb3_ctco.options import DEFAULT_DISCOUNT_RATE, discount
-from sb3_ctco.wrappers import SubOptions
+from sb3_ctco.options import DEFAULT_DISCOUNT_RATE, SubOptions, discount
 
 
 class _OptionStorage(ReplayBuffer):
     """What the two option buffers add to their Stable-Baselines3 base."""
+
+    #: Of buffers that were saved without one
+    reward_scale = 1.0
 
     def __init__(
         self,
@@ -27,6 +30,7 @@ class _OptionStorage(ReplayBuffer):
         optimize_memory_usage: bool = False,
         handle_timeout_termination: bool = True,
         discount_rate: float = DEFAULT_DISCOUNT_RATE,
+        reward_scale: float = 1.0,
     ):
         if optimize_memory_usage:
             raise ValueError(
@@ -44,6 +48,7 @@ class _OptionStorage(ReplayBuffer):
             handle_timeout_termination=handle_timeout_termination,
         )
         self.discount_rate = float(discount_rate)
+        self.reward_scale = float(reward_scale)
         self.durations = np.zeros((self.buffer_size, self.n_envs), dtype=np.float32)
         self.integrated_rewards = np.zeros((self.buffer_size, self.n_envs), dtype=np.float32)
         #: How many decisions were ever added (without sub-options), and how long their options took, in s.
@@ -72,7 +77,8 @@ class _OptionStorage(ReplayBuffer):
         :param infos: each with ``info["option"]`` of :class:`~sb3_ctco.wrappers.OptionExecutionWrapper`, and
             ``info["sub_options"]`` if it hands over any; nothing is stored of environments whose option runs on
             (``info["pending"]`` of :class:`~sb3_ctco.common.vec_env.AsyncOptionVecEnv`)
-        :raises ValueError: if that is missing, not finite, or was discounted at another rate; nothing is stored then
+        :raises ValueError: if that is missing, not finite, or was discounted at another rate, or if sub-options saw other
+            observations than these; nothing is stored then
         """
         try:
             options = {i: info["option"] for i, info in enumerate(infos) if PENDING not in info}
@@ -91,6 +97,11 @@ class _OptionStorage(ReplayBuffer):
                 f"the environment discounts an option of {durations} s by {discounts}, this buffer, at discount_rate="
                 f"{self.discount_rate}, by {discount(durations, self.discount_rate)}: give both the same discount_rate"
             )
+        sub_options = {
+            i: _as_stored(infos[i]["sub_options"], _rows(obs, i), None if done[i] else _rows(next_obs, i))
+            for i in options
+            if "sub_options" in infos[i]
+        }
         for i, option in options.items():
             position, row, info = self.pos, slice(i, i + 1), infos[i]
             super().add(
@@ -105,8 +116,8 @@ class _OptionStorage(ReplayBuffer):
             self.integrated_rewards[position] = option["integrated_reward"]
             self.n_decisions += 1
             self.decision_seconds += option["duration"]
-            if "sub_options" in info:
-                self._add_sub_options(info["sub_options"])
+            if i in sub_options:
+                self._add_sub_options(sub_options[i])
 
     def _add_sub_options(self, sub_options: SubOptions) -> None:
         count = len(sub_options)
@@ -151,7 +162,7 @@ class _OptionStorage(ReplayBuffer):
             "actions": self._tensor(rows(self.actions)),
             "next_observations": observations(self.next_observations),
             "dones": self._tensor(dones[:, None]),
-            "rewards": self._tensor(rows(self.integrated_rewards)[:, None]),
+            "rewards": self._tensor(rows(self.integrated_rewards)[:, None]) * self.reward_scale,
             "discounts": self._tensor(discount(rows(self.durations), self.discount_rate)[:, None]),
         }
 
@@ -159,19 +170,62 @@ class _OptionStorage(ReplayBuffer):
         return th.from_numpy(array).to(self.device)
 
 
-def _rows(obs: np.ndarray | dict[str, np.ndarray], row: slice) -> np.ndarray | dict[str, np.ndarray]:
-    return {key: value[row] for key, value in obs.items()} if isinstance(obs, dict) else obs[row]
+def _rows(obs: Any, rows: slice | int) -> Any:
+    return {key: value[rows] for key, value in obs.items()} if isinstance(obs, dict) else obs[rows]
+
+
+def _as_stored(sub_options: SubOptions, first: Any, last: Any) -> SubOptions:
+    """Sub-options with observations as the algorithm sees them, which they came past as part of an info.
+
+    :param sub_options: as the environment handed them over
+    :param first: the observation that the option began with, as the algorithm saw it
+    :param last: likewise the one that it ended with; None at an episode's end, where a VecNormalize gives it back
+        inexactly
+    :raises ValueError: if what the algorithm saw is not what the sub-options saw, give or take the transposition of images
+    """
+    seen: Any = sub_options.seen
+    if isinstance(first, dict) and isinstance(seen, dict) and first.keys() == seen.keys():
+        seen = {key: _matching(seen[key], first[key], None if last is None else last[key]) for key in seen}
+    elif not isinstance(first, dict) and not isinstance(seen, dict):
+        seen = _matching(seen, first, last)
+    else:
+        raise _not_seen(_described(seen), _described(first))
+    return dataclasses.replace(sub_options, seen=seen)
+
+
+def _matching(seen: np.ndarray, first: np.ndarray, last: np.ndarray | None) -> np.ndarray:
+    """``seen``, with its channels first if Stable-Baselines3's VecTransposeImage put them there."""
+    for candidate in (seen, np.moveaxis(seen, -1, 1)) if seen.ndim == 4 else (seen,):
+        ends = ((candidate[0], first),) if last is None else ((candidate[0], first), (candidate[-1], last))
+        # A VecEnv converts observations to their space's type.
+        if all(one.shape == np.shape(other) and (one.astype(other.dtype) == other).all() for one, other in ends):
+            return candidate
+    raise _not_seen(f"{seen[0]} (shape {seen.shape[1:]})", f"{first} (shape {np.shape(first)})")
+
+
+def _described(obs: Any) -> str:
+    return f"a dictionary of {sorted(obs)}" if isinstance(obs, dict) else f"an array of shape {np.shape(obs)}"
+
+
+def _not_seen(by_sub_options: str, by_algorithm: str) -> ValueError:
+    return ValueError(
+        f"sub-options have observations from inside OptionExecutionWrapper, {by_sub_options}, but the algorithm observes "
+        f"{by_algorithm}: put wrappers that change observations inside, OptionExecutionWrapper(ObservationWrapper(env)), "
+        "or pass n_sub_options=0 (VecNormalize and VecTransposeImage may be outside)"
+    )
 
 
 class OptionReplayBuffer(_OptionStorage):
     """Stable-Baselines3's ``ReplayBuffer`` for options.
 
     Beside its fields it keeps ``durations`` (time that ran, s) and ``integrated_rewards`` (R). All have the shape
-    ``[buffer_size, 1, ...]`` with one row a transition, whichever environment it is from. A sample has R as ``rewards``
-    and e^(−τ·duration) as ``discounts``, which SAC and TD3 use as they are: with this buffer and an environment wrapped
-    in :class:`~sb3_ctco.wrappers.OptionExecutionWrapper` they learn on the semi-Markov process.
+    ``[buffer_size, 1, ...]`` with one row a transition, whichever environment it is from. A sample has R, times
+    ``reward_scale``, as ``rewards`` and e^(−τ·duration) as ``discounts``, which SAC and TD3 use as they are: with this buffer
+    and an environment wrapped in :class:`~sb3_ctco.wrappers.OptionExecutionWrapper` they learn on the semi-Markov process.
 
     :param discount_rate: τ, in 1/s; the wrapper's
+    :param reward_scale: what R is multiplied by in samples; ``1/step_weight(dt, discount_rate)`` gives R the unit of a reward
+        of 1 over ``dt``, so that an option of one step is worth to a stock algorithm what a step is
     :raises ValueError: if ``optimize_memory_usage`` is asked for
     """
 

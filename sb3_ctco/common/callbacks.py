@@ -1,13 +1,29 @@
 """Time accounting: callbacks that see primitive steps while the algorithm takes decisions."""
 
 from collections import deque
+from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
 from stable_baselines3.common.base_class import BaseAlgorithm
-from stable_baselines3.common.callbacks import BaseCallback, ProgressBarCallback
+from stable_baselines3.common.callbacks import (
+    BaseCallback,
+    CallbackList,
+    EvalCallback,
+    EventCallback,
+    ProgressBarCallback,
+)
 
 from sb3_ctco.common.vec_env import PENDING
+
+
+def eval_callbacks(callback: BaseCallback | None) -> Iterator[EvalCallback]:
+    """The callbacks that evaluate, also those that others contain."""
+    if isinstance(callback, EvalCallback):
+        yield callback
+    children = callback.callbacks if isinstance(callback, CallbackList) else []
+    for child in [*children, callback.callback] if isinstance(callback, EventCallback) else children:
+        yield from eval_callbacks(child)
 
 
 class PrimitiveStepCallback(BaseCallback):

@@ -12,6 +12,7 @@ from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.type_aliases import PolicyPredictor
 from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv
 
+from sb3_ctco.common.vec_env import PENDING, PLAYED
 from sb3_ctco.options import DEFAULT_DISCOUNT_RATE, discount, step_weight
 
 
@@ -60,7 +61,7 @@ class EpisodeStatistics:
     :param discounted_return: ∫ e^(−τt) r dt, equation (2) of Karimi et al. 2023, in reward rate × s
     :param seconds: task time of the episode, in s
     :param decisions: how often the policy was asked
-    :param episode_return: sum of the rewards that ``step`` returned
+    :param episode_return: sum of the primitive rewards, from ``Monitor``; without one, of what ``step`` returned
     :param mean_absolute_jerk: of the primitive actions, see :func:`mean_absolute_jerk`; nan if not measured
     :param spectral_smoothness: likewise, see :func:`spectral_smoothness`
     """
@@ -76,6 +77,23 @@ class EpisodeStatistics:
     def decision_rate_hz(self) -> float:
         """Decisions a second of task time."""
         return self.decisions / self.seconds
+
+
+def _find_discount_rate(env: VecEnv, given: float | None) -> float:
+    """τ, in 1/s, of an environment whose steps are options; of any other what is given, or the default.
+
+    :raises ValueError: if the environment's is another than what is given, or its environments differ
+    """
+    if not env.has_attr("option_space"):
+        return DEFAULT_DISCOUNT_RATE if given is None else given
+    rates = [settings.discount_rate for settings in env.get_attr("option_space")]
+    expected = rates[0] if given is None else given
+    if not np.allclose(rates, expected, rtol=1e-6, atol=0.0):
+        raise ValueError(
+            f"the environments' options are discounted at discount_rate={rates}, within them, so not at {expected} between "
+            "them: leave discount_rate out, or make the environments with the same"
+        )
+    return expected
 
 
 @dataclass
@@ -97,6 +115,8 @@ class _EpisodeTracker:
         """
         ended = []
         for i, (reward, done, info) in enumerate(zip(rewards, dones, infos, strict=True)):
+            if PENDING in info:
+                continue
             if "option" in info:
                 duration, integral = info["option"]["duration"], info["option"]["integrated_reward"]
             elif self.dt is not None:
@@ -109,6 +129,8 @@ class _EpisodeTracker:
             episode.decisions += 1
             episode.episode_return += float(reward)
             if done:
+                if "episode" in info:
+                    episode.episode_return = info["episode"]["r"]
                 ended.append(episode)
                 self.running[i] = EpisodeStatistics()
         return ended
@@ -123,7 +145,7 @@ class _ActionRecorder:
 
     def __post_init__(self) -> None:
         self.actions = [[] for _ in range(self.env.num_envs)]
-        self.is_option_env = self.env.has_attr("option_settings")
+        self.is_option_env = self.env.has_attr("option_space")
         space = self.env.get_attr("primitive_action_space")[0] if self.is_option_env else self.env.action_space
         if not (isinstance(space, spaces.Box) and np.isfinite(space.low).all() and np.isfinite(space.high).all()):
             raise ValueError(f"smoothness is measured of actions in a Box with finite bounds, not in {space}")
@@ -136,8 +158,11 @@ class _ActionRecorder:
         """
         ended = []
         for i, (action, done, info) in enumerate(zip(actions, dones, infos, strict=True)):
+            if PENDING in info:
+                continue
             if self.is_option_env:
-                played = self.env.env_method("plan", action, indices=i)[0][: info["option"]["n_steps"]]
+                option = info.get(PLAYED, action)
+                played = self.env.env_method("plan", option, indices=i)[0][: info["option"]["n_steps"]]
             else:
                 played = action[None]
             self.actions[i].append(2.0 * (played - self.low) / self.range - 1.0)
@@ -153,27 +178,27 @@ def evaluate_discounted_return(
     env: gym.Env | VecEnv,
     n_eval_episodes: int = 20,
     deterministic: bool = True,
-    discount_rate: float = DEFAULT_DISCOUNT_RATE,
+    discount_rate: float | None = None,
     dt: float | None = None,
     smoothness: bool = False,
 ) -> list[EpisodeStatistics]:
     """Play whole episodes.
 
     :param model: anything with Stable-Baselines3's ``predict``
-    :param env: the environment that the model acts in: for CTCO one wrapped in ``OptionExecutionWrapper``, with the
-        same ``discount_rate``
+    :param env: the environment that the model acts in: for CTCO one wrapped in ``OptionExecutionWrapper``
     :param n_eval_episodes: number of episodes
     :param deterministic: whether to act greedily
-    :param discount_rate: τ, in 1/s
+    :param discount_rate: τ, in 1/s; by default the environment's where steps are options, and the paper's 0.404 elsewhere
     :param dt: interaction period in s, needed where steps are no options
     :param smoothness: whether to measure the smoothness of the primitive actions as well, normalised to [−1, 1]
     :return: one entry an episode
-    :raises ValueError: if smoothness is asked for where actions are not in a Box with finite bounds
+    :raises ValueError: if the environment's options are discounted at another rate, or if smoothness is asked for where
+        actions are not in a Box with finite bounds
     """
     if not isinstance(env, VecEnv):
         single = env
         env = DummyVecEnv([lambda: single])
-    tracker = _EpisodeTracker(env.num_envs, discount_rate, dt)
+    tracker = _EpisodeTracker(env.num_envs, _find_discount_rate(env, discount_rate), dt)
     recorder = _ActionRecorder(env) if smoothness else None
     episodes: list[EpisodeStatistics] = []
     obs = env.reset()
@@ -197,11 +222,12 @@ class DiscountedReturnCallback(BaseCallback):
 
     Logs ``rollout/ep_discounted_return_mean`` over the last 100 episodes.
 
-    :param discount_rate: τ, in 1/s
+    :param discount_rate: τ, in 1/s; by default the environment's where steps are options, and the paper's 0.404 elsewhere
     :param dt: interaction period in s, needed where the algorithm's steps are no options
+    :raises ValueError: when training starts, if the environment's options are discounted at another rate
     """
 
-    def __init__(self, discount_rate: float = DEFAULT_DISCOUNT_RATE, dt: float | None = None):
+    def __init__(self, discount_rate: float | None = None, dt: float | None = None):
         super().__init__()
         self.discount_rate = discount_rate
         self.dt = dt
@@ -210,7 +236,8 @@ class DiscountedReturnCallback(BaseCallback):
         self.timesteps: list[int] = []
 
     def _on_training_start(self) -> None:
-        self._tracker = _EpisodeTracker(self.training_env.num_envs, self.discount_rate, self.dt)
+        rate = _find_discount_rate(self.training_env, self.discount_rate)
+        self._tracker = _EpisodeTracker(self.training_env.num_envs, rate, self.dt)
 
     def _on_step(self) -> bool:
         infos = self.locals["infos"]

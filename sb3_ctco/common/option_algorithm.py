@@ -1,9 +1,12 @@
 """The base of off-policy algorithms that decide by options: environments, replay buffer, time accounting."""
 
-import dataclasses
 import io
+import json
+import math
 import pathlib
-from typing import Any, TypeVar
+import warnings
+import zipfile
+from typing import Any, ClassVar, Literal, TypeVar
 
 import gymnasium as gym
 import numpy as np
@@ -17,6 +20,7 @@ from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.noise import ActionNoise
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.policies import BasePolicy
+from stable_baselines3.common.save_util import open_path
 from stable_baselines3.common.type_aliases import (
     GymEnv,
     MaybeCallback,
@@ -26,19 +30,23 @@ from stable_baselines3.common.type_aliases import (
     TrainFrequencyUnit,
 )
 from stable_baselines3.common.vec_env import (
+    DummyVecEnv,
     VecEnv,
     VecEnvWrapper,
     VecFrameStack,
+    VecMonitor,
     VecTransposeImage,
     unwrap_vec_normalize,
     unwrap_vec_wrapper,
 )
 
 from sb3_ctco.common.buffers import DictOptionReplayBuffer, OptionReplayBuffer
-from sb3_ctco.common.callbacks import OptionProgressBarCallback, PrimitiveStepCallback
+from sb3_ctco.common.callbacks import OptionProgressBarCallback, PrimitiveStepCallback, eval_callbacks
+from sb3_ctco.common.load_arguments import check_load_arguments
 from sb3_ctco.common.vec_env import PLAYED, AsyncOptionVecEnv
-from sb3_ctco.options import OptionSettings, discount_rate_from_gamma
-from sb3_ctco.wrappers import OptionExecutionWrapper, SubOptions, find_dt
+from sb3_ctco.option_array import OptionArray
+from sb3_ctco.options import DurationScale, OptionSpace, Trajectory, discount_rate_from_gamma, step_weight
+from sb3_ctco.wrappers import OptionExecutionWrapper, find_dt
 
 SelfOptionOffPolicyAlgorithm = TypeVar("SelfOptionOffPolicyAlgorithm", bound="OptionOffPolicyAlgorithm")
 
@@ -57,6 +65,10 @@ class OptionOffPolicyAlgorithm(OffPolicyAlgorithm):
     :param d_max: longest duration of an option, in s
     :param d_min: shortest duration, in s; by default one step of the environment
     :param dt: the environment's interaction period, in s; by default found in the environment
+    :param trajectory: how ω becomes actions, a name in ``sb3_ctco.options.TRAJECTORIES`` or a class
+    :param duration_scale: ``"log"`` or ``"linear"``, see :class:`~sb3_ctco.options.OptionSpace`
+    :param reward_scale: what R is multiplied by for the critics, or ``"gamma_dt"`` for the unit of a reward of 1 over
+        ``gamma_dt``
     :param gamma: discount factor over ``gamma_dt`` seconds, in (0, 1]
     :param gamma_dt: in s
     :param train_freq: collect at least this many primitive steps (in each environment) between trainings
@@ -68,6 +80,26 @@ class OptionOffPolicyAlgorithm(OffPolicyAlgorithm):
     :raises ValueError: for settings out of range or contradicting each other or the environment's
     """
 
+    #: Arguments that ``load`` cannot change: what options mean, and what was learned or decides what is saved
+    _kept_when_loaded: ClassVar[tuple[str, ...]] = (
+        "n_rbf",
+        "d_max",
+        "d_min",
+        "trajectory",
+        "duration_scale",
+        "reward_scale",
+        "canonical_weights",
+        "n_repetitions",
+        "ent_coef",
+        "duration_ent_coef",
+        "target_decision_rate",
+    )
+    #: An attribute that this class's files have and others' have not
+    _own_setting: ClassVar[str] = "discount_rate"
+
+    #: Of arguments that older files do not have: what their networks were trained with
+    _before_it_was_saved: ClassVar[dict[str, Any]] = {"duration_scale": "linear", "reward_scale": 1.0}
+
     def __init__(
         self,
         policy: str | type[BasePolicy],
@@ -78,6 +110,9 @@ class OptionOffPolicyAlgorithm(OffPolicyAlgorithm):
         d_max: float,
         d_min: float | None,
         dt: float | None,
+        trajectory: str | type[Trajectory] = "rbf",
+        duration_scale: DurationScale = "linear",
+        reward_scale: float | Literal["gamma_dt"] = 1.0,
         gamma: float,
         gamma_dt: float,
         updates_per_second: float | None,
@@ -90,12 +125,17 @@ class OptionOffPolicyAlgorithm(OffPolicyAlgorithm):
         self.d_max = d_max
         self.d_min = d_min
         self.dt = dt
+        self.trajectory = trajectory
+        self.duration_scale: DurationScale = duration_scale
+        self.reward_scale: float | Literal["gamma_dt"] = reward_scale
         self.gamma = gamma
         self.gamma_dt = gamma_dt
         # An explicit dt stays the user's word on any environment; one that was found must be found again.
         self._dt_was_given = dt is not None
         #: τ, in 1/s
         self.discount_rate = discount_rate_from_gamma(gamma, gamma_dt)
+        if reward_scale != "gamma_dt" and not (isinstance(reward_scale, int | float) and 0 < reward_scale < math.inf):
+            raise ValueError(f"reward_scale must be a positive number or 'gamma_dt', not {reward_scale!r}")
         if updates_per_second is not None:
             if gradient_steps != -1:
                 raise ValueError(
@@ -128,7 +168,7 @@ class OptionOffPolicyAlgorithm(OffPolicyAlgorithm):
         )
 
     @property
-    def option_settings(self) -> OptionSettings:
+    def option_space(self) -> OptionSpace:
         """What the policy's option vectors mean.
 
         :raises ValueError: before ``dt`` and ``d_min`` are known, that is without an environment
@@ -138,9 +178,13 @@ class OptionOffPolicyAlgorithm(OffPolicyAlgorithm):
                 f"dt={self.dt} s and d_min={self.d_min} s are found in an environment, and {type(self).__name__} has not "
                 "had one: pass it env, or dt and d_min"
             )
-        return OptionSettings(
-            n_rbf=self.n_rbf, d_max=self.d_max, d_min=self.d_min, dt=self.dt, discount_rate=self.discount_rate
-        )
+        return OptionSpace.make(**{**self._option_arguments, "dt": self.dt, "d_min": self.d_min})
+
+    @property
+    def _option_arguments(self) -> dict[str, Any]:
+        """OptionExecutionWrapper's arguments for the same options, ``dt`` and ``d_min`` as far as they are known."""
+        names = ("n_rbf", "d_max", "d_min", "dt", "trajectory", "duration_scale", "discount_rate")
+        return {name: getattr(self, name) for name in names}
 
     @classmethod
     def wrapper_kwargs(cls, arguments: dict[str, Any]) -> dict[str, Any]:
@@ -148,8 +192,8 @@ class OptionOffPolicyAlgorithm(OffPolicyAlgorithm):
 
         :param arguments: the algorithm's arguments, defaults included
         """
-        kwargs = {name: arguments[name] for name in ("n_rbf", "d_max", "d_min", "dt")}
-        kwargs["n_sub_options"] = arguments.get("n_sub_options", 0)
+        names = ("n_rbf", "d_max", "d_min", "dt", "trajectory", "duration_scale", "n_sub_options")
+        kwargs = {name: arguments[name] for name in names if name in arguments}
         return {**kwargs, "discount_rate": discount_rate_from_gamma(arguments["gamma"], arguments["gamma_dt"])}
 
     def wrap_env(self, env: gym.Env, n_sub_options: int = 0) -> OptionExecutionWrapper:
@@ -162,24 +206,19 @@ class OptionOffPolicyAlgorithm(OffPolicyAlgorithm):
         dt = self.dt if self._dt_was_given else (find_dt(env) or self.dt)
         if unwrap_wrapper(env, Monitor) is None:
             env = Monitor(env)
-        return OptionExecutionWrapper(
-            env,
-            n_rbf=self.n_rbf,
-            d_max=self.d_max,
-            d_min=self.d_min,
-            dt=dt,
-            discount_rate=self.discount_rate,
-            n_sub_options=n_sub_options,
-        )
+        return OptionExecutionWrapper(env, **{**self._option_arguments, "dt": dt}, n_sub_options=n_sub_options)
 
     def _as_option_env(self, env: GymEnv) -> GymEnv:
         if isinstance(env, VecEnv):
             if not all(env.env_is_wrapped(OptionExecutionWrapper)):
                 raise ValueError(
                     f"{type(self).__name__} cannot wrap the environments of a VecEnv from outside: make it with "
-                    "make_vec_env(..., wrapper_class=OptionExecutionWrapper, wrapper_kwargs=dict(n_rbf=..., d_max=...))"
+                    "make_vec_env(..., wrapper_class=OptionExecutionWrapper, wrapper_kwargs=dict(n_rbf=..., d_max=...)). "
+                    "With RL Zoo, the command sb3-ctco in the place of python -m rl_zoo3 does so"
                 )
+            _warn_of_outer_monitors(env)
             return env
+        _warn_of_outer_monitors(env)
         wrapped = unwrap_wrapper(env, OptionExecutionWrapper)
         if wrapped is None:
             return self.wrap_env(env, self.n_sub_options)
@@ -188,7 +227,23 @@ class OptionOffPolicyAlgorithm(OffPolicyAlgorithm):
             wrapped.env = Monitor(wrapped.env)  # type: ignore[attr-defined]
         return env
 
-    def _check_env(self, env: VecEnv) -> OptionSettings:
+    def _as_eval_env(self, env: VecEnv) -> VecEnv:
+        """The environment of an EvalCallback, which made a ``DummyVecEnv`` of the one that it was given."""
+        if not all(env.env_is_wrapped(OptionExecutionWrapper)):
+            if type(env) is not DummyVecEnv:
+                raise ValueError(
+                    f"EvalCallback evaluates in a {type(env).__name__} of environments that do not play options: pass it "
+                    "model.wrap_env(env), or make it with make_vec_env(..., wrapper_class=OptionExecutionWrapper, "
+                    "wrapper_kwargs=dict(n_rbf=..., d_max=...))"
+                )
+            bare, env = env, DummyVecEnv([lambda inner=inner: self.wrap_env(inner) for inner in env.envs])  # type: ignore[misc]
+            if bare._seeds[0] is not None:
+                env.seed(bare._seeds[0])
+        _warn_of_outer_monitors(env)
+        self._check_settings(env)
+        return env
+
+    def _check_env(self, env: VecEnv) -> OptionSpace:
         """The options' settings of an environment, once they agree with the algorithm's."""
         normalizer = unwrap_vec_normalize(env)
         if normalizer is not None and normalizer.norm_reward:
@@ -209,21 +264,23 @@ class OptionOffPolicyAlgorithm(OffPolicyAlgorithm):
                         "runs on in AsyncOptionVecEnv: use SubprocVecEnv, or a Gymnasium wrapper inside"
                     )
                 wrapper = wrapper.venv
-        settings: list[OptionSettings] = env.get_attr("option_settings")
-        expected = {
-            "n_rbf": self.n_rbf,
-            "d_max": self.d_max,
-            "d_min": settings[0].d_min if self.d_min is None else self.d_min,
-            "dt": settings[0].dt if self.dt is None else self.dt,
-            "discount_rate": self.discount_rate,
-        }
+        settings = self._check_settings(env)
+        self.primitive_action_space = env.get_attr("primitive_action_space")[0]
+        # No setting that both must share, but what one wants of the other.
+        env.env_method("set_n_sub_options", self.n_sub_options)
+        return settings
+
+    def _check_settings(self, env: VecEnv) -> OptionSpace:
+        """The options' settings of an environment, once options mean the same in it as to the algorithm."""
+        settings: list[OptionSpace] = env.get_attr("option_space")
+        known = {name: value for name, value in self._option_arguments.items() if value is not None}
+        expected = OptionSpace.make(**{**settings[0].arguments, **known})
         for one in settings:
-            for name, value in expected.items():
-                if not np.isclose(getattr(one, name), value, rtol=1e-6, atol=0.0):
-                    raise ValueError(
-                        f"the environment's options have {name}={getattr(one, name)}, {type(self).__name__} has "
-                        f"{name}={value}: give both the same (discount_rate is -ln(gamma)/gamma_dt)"
-                    )
+            for name, (value, found) in expected.differences(one).items():
+                raise ValueError(
+                    f"the environment's options have {name}={found}, {type(self).__name__} has "
+                    f"{name}={value}: give both the same (discount_rate is -ln(gamma)/gamma_dt)"
+                )
         action_spaces: list[spaces.Box] = env.get_attr("primitive_action_space")
         for space in action_spaces:
             if space != (self.primitive_action_space or action_spaces[0]):
@@ -231,9 +288,6 @@ class OptionOffPolicyAlgorithm(OffPolicyAlgorithm):
                     f"the environment's actions are in {space}, {type(self).__name__} learned actions in "
                     f"{self.primitive_action_space or action_spaces[0]}: options mean the same in both only if these agree"
                 )
-        self.primitive_action_space = action_spaces[0]
-        # No setting that both must share, but what one wants of the other.
-        env.env_method("set_n_sub_options", self.n_sub_options)
         return settings[0]
 
     def set_env(self, env: GymEnv, force_reset: bool = True) -> None:
@@ -258,8 +312,21 @@ class OptionOffPolicyAlgorithm(OffPolicyAlgorithm):
     ) -> SelfOptionOffPolicyAlgorithm:
         """Stable-Baselines3's ``load``; a bare environment is wrapped with the settings in the file.
 
-        :raises ValueError: if the environment's settings differ from the file's
+        :param kwargs: arguments of the constructor to change, such as ``learning_rate``, ``buffer_size`` or ``gamma``; not
+            those that options or networks depend on (such as ``n_rbf``, ``d_max``, ``d_min``, ``policy_kwargs``), and
+            not the temperatures, which are learned and saved
+        :raises TypeError: for an argument that the constructor does not have
+        :raises ValueError: if the environment's settings differ from the file's, for an argument that cannot be changed, or if
+            another algorithm wrote the file
         """
+        saved = cls._saved_attributes(path)
+        kwargs = check_load_arguments(cls, path, kwargs, cls._kept_when_loaded)
+        kwargs.update({name: value for name, value in cls._before_it_was_saved.items() if saved and name not in saved})
+        # Of two that say the same in different ways, the one that is given holds.
+        if "gradient_steps" in kwargs:
+            kwargs.setdefault("updates_per_second", None)
+        elif kwargs.get("updates_per_second") is not None:
+            kwargs["gradient_steps"] = -1
         if env is not None:
             kwargs["n_envs"] = env.num_envs if isinstance(env, VecEnv) else 1
         model = super().load(path, None, device, custom_objects, print_system_info, force_reset, **kwargs)
@@ -269,6 +336,25 @@ class OptionOffPolicyAlgorithm(OffPolicyAlgorithm):
             if model.seed is not None:
                 model.env.seed(model.seed)  # type: ignore[union-attr]
         return model
+
+    @classmethod
+    def _saved_attributes(cls, path: str | pathlib.Path | io.BufferedIOBase) -> dict[str, Any]:
+        """What a file says of a model's attributes, as JSON; empty if it is no zip file.
+
+        :raises ValueError: if another algorithm wrote it
+        """
+        file = open_path(path, "r", verbose=0, suffix="zip")
+        attributes = json.loads(zipfile.ZipFile(file).read("data")) if zipfile.is_zipfile(file) else {}
+        if file is path:
+            file.seek(0)
+        else:
+            file.close()
+        writer = attributes.get("policy_class", {}).get("__module__", "an unknown module")
+        if attributes and cls._own_setting not in attributes:
+            raise ValueError(
+                f"{path} was not saved by {cls.__name__}: its policy is from {writer}. Load it with the class that saved it"
+            )
+        return attributes
 
     def _setup_model(self) -> None:
         if self.n_steps != 1:
@@ -283,17 +369,59 @@ class OptionOffPolicyAlgorithm(OffPolicyAlgorithm):
                 f"replay_buffer_class must be OptionReplayBuffer, DictOptionReplayBuffer or a subclass, not "
                 f"{self.replay_buffer_class.__name__}, which does not keep the durations of options"
             )
-        self.replay_buffer_kwargs = {**self.replay_buffer_kwargs, "discount_rate": self.discount_rate}
+        # Once more, since load may have changed gamma.
+        self.discount_rate = discount_rate_from_gamma(self.gamma, self.gamma_dt)
+        scale = 1.0 / step_weight(self.gamma_dt, self.discount_rate) if self.reward_scale == "gamma_dt" else self.reward_scale
+        self.replay_buffer_kwargs = {
+            **self.replay_buffer_kwargs,
+            "discount_rate": self.discount_rate,
+            "reward_scale": scale,
+        }
         if self.env is not None:
             settings = self._check_env(self.env)
             self.dt, self.d_min = settings.dt, settings.d_min
         super()._setup_model()
+        self._warn_of_a_large_buffer()
+
+    def _warn_of_a_large_buffer(self) -> None:
+        buffer, available = self.replay_buffer, _available_memory()
+        if not isinstance(buffer, OptionReplayBuffer | DictOptionReplayBuffer) or available is None:
+            return
+        planned = buffer.bytes_per_transition * buffer.buffer_size
+        if planned <= available:
+            return
+        decisions = buffer.buffer_size // (1 + self.n_sub_options)
+        span = "" if self.d_min is None else f", {decisions * self.d_min:,.0f} to {decisions * self.d_max:,.0f} s of task time"
+        warnings.warn(
+            f"buffer_size={buffer.buffer_size:,} plans {planned / 1e9:.1f} GB of memory, and {available / 1e9:.1f} GB are "
+            f"available: pass a smaller one, {available // 2 // buffer.bytes_per_transition:,} for half of that. With "
+            f"n_sub_options={self.n_sub_options} this buffer holds at least {decisions:,} decisions{span}",
+            stacklevel=4,
+        )
+
+    def load_replay_buffer(self, path: str | pathlib.Path | io.BufferedIOBase, truncate_last_traj: bool = True) -> None:
+        """Stable-Baselines3's; what is in the buffer is scaled as this algorithm scales rewards.
+
+        :raises ValueError: if its options were discounted at another rate
+        """
+        super().load_replay_buffer(path, truncate_last_traj)
+        buffer = self.replay_buffer
+        assert isinstance(buffer, OptionReplayBuffer | DictOptionReplayBuffer)
+        if not math.isclose(buffer.discount_rate, self.discount_rate, rel_tol=1e-6):
+            self.replay_buffer = None
+            raise ValueError(
+                f"the replay buffer in {path} has discount_rate={buffer.discount_rate}, {type(self).__name__} has "
+                f"discount_rate={self.discount_rate}: load it into a model with the same gamma and gamma_dt"
+            )
+        buffer.reward_scale = self.replay_buffer_kwargs["reward_scale"]
 
     def _init_callback(self, callback: MaybeCallback, progress_bar: bool = False) -> BaseCallback:
         if isinstance(callback, list):
             callback = CallbackList(callback)
         elif callback is not None and not isinstance(callback, BaseCallback):
             callback = ConvertCallback(callback)
+        for evaluating in eval_callbacks(callback):
+            evaluating.eval_env = self._as_eval_env(evaluating.eval_env)
         callbacks: list[BaseCallback] = [PrimitiveStepCallback(callback)]
         if progress_bar:
             callbacks.append(OptionProgressBarCallback())
@@ -348,22 +476,25 @@ class OptionOffPolicyAlgorithm(OffPolicyAlgorithm):
         dones: np.ndarray,
         infos: list[dict[str, Any]],
     ) -> None:
+        # A copy, since the caller's array may be the one that the environment is given.
+        buffer_action = buffer_action.copy()
         for i, info in enumerate(infos):
-            if "sub_options" in info:
-                self._residuals_since_log.extend(info["sub_options"].residuals)
-                info["sub_options"] = self._as_stored(info["sub_options"])
             if PLAYED in info:
                 buffer_action[i] = self.policy.scale_action(info[PLAYED])
+        self._see_what_ran(buffer_action, infos)
         super()._store_transition(replay_buffer, buffer_action, new_obs, reward, dones, infos)
-        self._durations_since_log.extend(info["option"]["duration"] for info in infos if "option" in info)
+        for info in infos:
+            if "option" in info:
+                self._durations_since_log.append(info["option"]["duration"])
+            if "sub_options" in info:
+                self._residuals_since_log.extend(info["sub_options"].residuals)
 
-    def _as_stored(self, sub_options: SubOptions) -> SubOptions:
-        """Sub-options come past the wrappers of the VecEnv, of which VecTransposeImage changes what is stored."""
-        assert self.env is not None
-        transpose = unwrap_vec_wrapper(self.env, VecTransposeImage)
-        if transpose is None:
-            return sub_options
-        return dataclasses.replace(sub_options, seen=transpose.transpose_observations(sub_options.seen))
+    def _see_what_ran(self, options: np.ndarray, infos: list[dict[str, Any]]) -> None:
+        """Adapt options to what ran of them, in place, before they are stored; a subclass may need to.
+
+        :param options: normalised, ``[n_envs, option_dim]``
+        :param infos: each with ``info["option"]``, unless its option runs on
+        """
 
     def dump_logs(self) -> None:
         """Write log data; also the durations of options, their mean and the decision rate since the last time."""
@@ -389,9 +520,43 @@ class OptionOffPolicyAlgorithm(OffPolicyAlgorithm):
     ) -> tuple[np.ndarray, tuple[np.ndarray, ...] | None]:
         """The policy's *option* for an observation, not an action of the bare environment.
 
-        Step the wrapped environment (``model.get_env()``, or :meth:`wrap_env` around your own) with it.
+        Step the wrapped environment (``model.get_env()``, or :meth:`wrap_env` around your own) with it. A bare environment
+        that takes it for an action gets an error that says so, see :class:`~sb3_ctco.option_array.OptionArray`.
 
         :return: the option ``[ω, d]``, shape ``[action_dim · n_rbf + 1]`` in [−1, 1] (with a leading axis for several
             observations), and None
         """
-        return super().predict(observation, state, episode_start, deterministic)
+        options, state = super().predict(observation, state, episode_start, deterministic)
+        return options.view(OptionArray), state
+
+
+def _available_memory() -> int | None:
+    """Memory that can be had without swapping, in bytes, on Linux; elsewhere None, and Stable-Baselines3 asks psutil."""
+    try:
+        lines = pathlib.Path("/proc/meminfo").read_text().splitlines()
+    except OSError:
+        return None
+    return next((1024 * int(line.split()[1]) for line in lines if line.startswith("MemAvailable:")), None)
+
+
+def _warn_of_outer_monitors(env: GymEnv) -> None:
+    """Warn of a Monitor that sees options, where a step of it is a decision."""
+    outside: gym.Env | VecEnv | None = unwrap_vec_wrapper(env, VecMonitor) if isinstance(env, VecEnv) else env
+    if isinstance(env, VecEnv) and outside is None and isinstance(env.unwrapped, DummyVecEnv):
+        outside = env.unwrapped.envs[0]
+    while isinstance(outside, gym.Wrapper) and not isinstance(outside, OptionExecutionWrapper | Monitor):
+        outside = outside.env
+    if isinstance(outside, Monitor | VecMonitor) and _plays_options(env):
+        name = type(outside).__name__
+        warnings.warn(
+            f"{name} is outside OptionExecutionWrapper, so the episode lengths that it reports count decisions, not "
+            "environment steps: use OptionExecutionWrapper(Monitor(env)), as model.wrap_env(env) and make_vec_env(..., "
+            "wrapper_class=OptionExecutionWrapper) do",
+            stacklevel=3,
+        )
+
+
+def _plays_options(env: GymEnv) -> bool:
+    if isinstance(env, VecEnv):
+        return all(env.env_is_wrapped(OptionExecutionWrapper))
+    return unwrap_wrapper(env, OptionExecutionWrapper) is not None

@@ -11,7 +11,7 @@ from stable_baselines3.common.type_aliases import GymEnv
 from stable_baselines3.common.vec_env import VecEnv
 from stable_baselines3.sac.policies import SACPolicy
 
-from sb3_ctco.options import OptionSettings, discount, discount_rate_from_gamma
+from sb3_ctco.options import OptionSpace, discount, discount_rate_from_gamma, step_weight
 from sb3_ctco.wrappers import RewardRateWrapper
 
 
@@ -41,8 +41,9 @@ def sac_at_rate(
     """A plain SAC that at every ``dt`` learns as often a second, for the same discounted return.
 
     Its discount factor is γ^(dt/γ_dt) = e^(−τ·dt), its reward is a rate held over a step
-    (:class:`~sb3_ctco.wrappers.RewardRateWrapper`), and its ``train_freq`` and ``gradient_steps`` are the smallest that
-    give ``updates_per_second`` to a thousandth. This is the SAC of the paper's section "Empirical Analysis".
+    (:class:`~sb3_ctco.wrappers.RewardRateWrapper`) in the unit of a reward of 1 over ``gamma_dt``, and its ``train_freq`` and
+    ``gradient_steps`` are the smallest that give ``updates_per_second`` to a thousandth. With ``gamma_dt = dt`` it is stock
+    SAC on the rewards as they are. This is the SAC of the paper's section "Empirical Analysis".
 
     Example:
         >>> model = sac_at_rate("Pendulum-v1", dt=0.05, updates_per_second=5)
@@ -77,7 +78,8 @@ def sac_at_rate(
     if not (learning_starts_seconds >= 0 and np.isfinite(learning_starts_seconds)):
         raise ValueError(f"learning_starts_seconds must be at least 0, not {learning_starts_seconds}")
 
-    env = _with_reward_rate(maybe_make_env(env, kwargs.get("verbose", 0)), dt, discount_rate)
+    reward_scale = 1.0 / step_weight(gamma_dt, discount_rate)
+    env = _with_reward_rate(maybe_make_env(env, kwargs.get("verbose", 0)), dt, discount_rate, reward_scale)
     n_envs = env.num_envs if isinstance(env, VecEnv) else 1
     train_freq, gradient_steps = update_schedule(updates_per_second * dt * n_envs)
     return SAC(
@@ -91,20 +93,20 @@ def sac_at_rate(
     )
 
 
-def _with_reward_rate(env: GymEnv, dt: float, discount_rate: float) -> GymEnv:
+def _with_reward_rate(env: GymEnv, dt: float, discount_rate: float, reward_scale: float) -> GymEnv:
     if isinstance(env, VecEnv):
         if not all(env.env_is_wrapped(RewardRateWrapper)):
             raise ValueError(
                 "sac_at_rate cannot wrap the environments of a VecEnv from outside: make it with "
                 "make_vec_env(..., wrapper_class=RewardRateWrapper, wrapper_kwargs=dict(dt=..., discount_rate=...))"
             )
-        settings: list[OptionSettings] = env.get_attr("option_settings")
+        settings: list[OptionSpace] = env.get_attr("option_space")
     elif (wrapped := unwrap_wrapper(env, RewardRateWrapper)) is not None:
-        settings = [wrapped.option_settings]  # type: ignore[attr-defined]
+        settings = [wrapped.option_space]  # type: ignore[attr-defined]
     else:
         if unwrap_wrapper(env, Monitor) is None:
             env = Monitor(env)
-        return RewardRateWrapper(env, dt=dt, discount_rate=discount_rate)
+        return RewardRateWrapper(env, dt=dt, discount_rate=discount_rate, reward_scale=reward_scale)
     for one in settings:
         for name, value in (("dt", dt), ("discount_rate", discount_rate)):
             if not np.isclose(getattr(one, name), value, rtol=1e-6, atol=0.0):

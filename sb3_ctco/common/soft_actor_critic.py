@@ -1,6 +1,8 @@
 """Soft actor-critic on options: what CTCO and FiGAR-SAC share, their losses and the loop of updates."""
 
+import contextlib
 import math
+from collections.abc import Callable, Iterator
 from typing import Any
 
 import torch as th
@@ -8,39 +10,9 @@ from stable_baselines3.common.type_aliases import GymEnv, PyTorchObs, ReplayBuff
 from stable_baselines3.common.utils import FloatSchedule, get_parameters_by_name, polyak_update
 from torch import nn
 
+from sb3_ctco.common.losses import critic_loss
 from sb3_ctco.common.option_algorithm import OptionOffPolicyAlgorithm
 from sb3_ctco.common.policies import EnsembleCritic, SoftOptionPolicy, SquashedActor
-
-
-def critic_target(
-    integrated_rewards: th.Tensor,
-    dones: th.Tensor,
-    discounts: th.Tensor,
-    next_q_values: th.Tensor,
-    next_entropy_costs: th.Tensor,
-    high_freq_penalty: float = 0.0,
-) -> th.Tensor:
-    """``R − β_h + γ(d)·(Q̂_χ'(s', ω', d') − β_E log π(ω', d'|s'))``, the target in CTCO's L_Q (after equation (6)).
-
-    All tensors are ``[batch, 1]``.
-
-    :param integrated_rewards: R
-    :param dones: 1 where the episode terminated (not where it was truncated)
-    :param discounts: γ(d) = e^(−τ·duration)
-    :param next_q_values: smallest target Q-value of an option of the target policy
-    :param next_entropy_costs: β_E log π of that option
-    :param high_freq_penalty: β_h
-    """
-    return integrated_rewards - high_freq_penalty + (1.0 - dones) * discounts * (next_q_values - next_entropy_costs)
-
-
-def critic_loss(q_values: th.Tensor, targets: th.Tensor) -> th.Tensor:
-    """L_Q of CTCO's paper, as Stable-Baselines3's SAC scales it: half the mean square error, summed over critics.
-
-    :param q_values: ``[n_critics, batch, 1]``
-    :param targets: ``[batch, 1]``
-    """
-    return 0.5 * (q_values - targets).square().mean(dim=(1, 2)).sum()
 
 
 class SoftOptionActorCritic(OptionOffPolicyAlgorithm):
@@ -171,9 +143,9 @@ class SoftOptionActorCritic(OptionOffPolicyAlgorithm):
 
         self._target_entropies.copy_(th.tensor(self._current_target_entropies()))
         losses = []
-        for _ in range(gradient_steps):
-            data = self.replay_buffer.sample(batch_size, env=self._vec_normalize_env)
-            losses.append(self._update(data))
+        with self._begin_updates() as update:
+            for _ in range(gradient_steps):
+                losses.append(update(self.replay_buffer.sample(batch_size, env=self._vec_normalize_env)))
 
         self._n_updates += gradient_steps
         # Read once, because each reading waits for the device.
@@ -191,6 +163,11 @@ class SoftOptionActorCritic(OptionOffPolicyAlgorithm):
     def ent_coefs(self) -> th.Tensor:
         """Both temperatures, of what to do and of the duration, ``[2]``, without gradients."""
         return self.log_ent_coefs.detach().exp()
+
+    @contextlib.contextmanager
+    def _begin_updates(self) -> Iterator[Callable[[ReplayBufferSamples], th.Tensor]]:
+        """What makes the updates of a training: :meth:`_update`, or something faster that computes the same."""
+        yield self._update
 
     def _update(self, data: ReplayBufferSamples) -> th.Tensor:
         """One update of temperatures, critics, actor and targets.

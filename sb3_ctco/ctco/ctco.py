@@ -1,6 +1,8 @@
 """Continuous-Time Continuous-Options (Karimi et al. 2023, https://arxiv.org/abs/2212.04407) on Stable-Baselines3."""
 
+import contextlib
 import math
+from collections.abc import Callable, Iterator
 from typing import Any, ClassVar, Literal, TypeVar
 
 import torch as th
@@ -12,54 +14,19 @@ from stable_baselines3.common.utils import FloatSchedule, update_learning_rate
 from torch import nn
 
 from sb3_ctco.common.buffers import DictOptionReplayBuffer, OptionReplayBuffer
-from sb3_ctco.common.soft_actor_critic import SoftOptionActorCritic, critic_loss, critic_target
-from sb3_ctco.ctco.gradients import HandGradients
+from sb3_ctco.common.losses import ENTROPY_REFERENCES, EntropyReference, actor_loss, critic_target, log_reference_density
+from sb3_ctco.common.soft_actor_critic import SoftOptionActorCritic
+from sb3_ctco.ctco.canonical import CanonicalOptions
+from sb3_ctco.ctco.fast_update import FastUpdate
 from sb3_ctco.ctco.policies import CnnPolicy, CTCOPolicy, MlpPolicy, MultiInputPolicy, OptionActor, OptionCritic
-
-__all__ = ["CTCO", "actor_loss", "critic_loss", "critic_target", "log_reference_density"]
+from sb3_ctco.options import DurationScale, Trajectory
 
 SelfCTCO = TypeVar("SelfCTCO", bound="CTCO")
 
-EntropyReference = Literal["uniform", "paper", "duration"]
-ENTROPY_REFERENCES: tuple[EntropyReference, ...] = ("uniform", "paper", "duration")
 
-
-def actor_loss(q_values: th.Tensor, entropy_costs: th.Tensor) -> th.Tensor:
-    """L_π, equation (8) of the paper: its gradient runs through ω and d of reparameterised options.
-
-    :param q_values: ``[n_critics, batch, 1]``, of options that the policy sampled
-    :param entropy_costs: β_E log π of those options, ``[batch, 1]``
-    """
-    return (entropy_costs - q_values.amin(dim=0)).mean()
-
-
-def log_reference_density(omega_dim: int, d_min: float, d_max: float, reference: EntropyReference) -> th.Tensor:
-    """Log-density of what entropy is counted relative to, over the normalised option box.
-
-    ``"uniform"`` is the uniform distribution over all options: log π − log u is never negative on average, so
-    a decision is never paid for its entropy. ``"paper"`` is the unit density over (ω, d in s): log π as it stands.
-    ``"duration"`` counts relative to the uniform distribution, too, and weights a decision's entropy by its option's
-    duration, see :func:`duration_weight`.
-
-    :return: for ω and d, shape ``[2]``
-    """
-    if reference != "paper":
-        return th.tensor([-omega_dim * math.log(2.0), -math.log(2.0)])
-    # A duration in s has (d_max − d_min)/2 of the length of the box [−1, 1].
-    return th.tensor([0.0, math.log((d_max - d_min) / 2.0) if d_max > d_min else 0.0])
-
-
-def duration_weight(durations: th.Tensor, d_min: float, d_max: float, discount_rate: float) -> th.Tensor:
-    """(1 − e^(−τd))/τ: what an entropy that is paid as a rate, for as long as an option runs, is worth at its start.
-
-    :param durations: normalised to [−1, 1], any shape
-    :param d_min: in s
-    :param d_max: in s
-    :param discount_rate: τ, in 1/s
-    :return: in s, the shape of ``durations``; the limit d for τ → 0
-    """
-    seconds = d_min + 0.5 * (durations + 1.0) * (d_max - d_min)
-    return -th.expm1(-discount_rate * seconds) / discount_rate if discount_rate > 0 else seconds
+def _longest(d_max: float | None, gamma_dt: float) -> float:
+    """The longest duration, in s: by default what follows from the horizon as the user states it."""
+    return 10.0 * gamma_dt if d_max is None else d_max
 
 
 class CTCO(SoftOptionActorCritic):
@@ -74,7 +41,8 @@ class CTCO(SoftOptionActorCritic):
     Where it differs from the paper, the paper's way is an argument away: entropy counts relative to the uniform
     distribution (``entropy_reference="paper"``), two critics (``policy_kwargs=dict(n_critics=1)``), a temperature each
     for ω and d, learned (pass numbers; the same one twice is the paper's β_E), ω squashed by tanh so that actions stay
-    in their bounds, and a shortest duration of one step (the paper's durations are in (0, d_max)).
+    in their bounds, a shortest duration of one step (the paper's durations are in (0, d_max)), and critics that see what
+    short options play (``canonical_weights=False``).
 
     Settings that the paper's algorithm would have are in :meth:`paper_defaults`; the class's own were measured to learn
     faster on the paper's tasks.
@@ -97,9 +65,14 @@ class CTCO(SoftOptionActorCritic):
     :param n_sub_options: how many random stretches of each option that was played go into the replay buffer beside it,
         as options of their own, which counts in ``buffer_size``; 0 is the paper's way
     :param n_rbf: number of radial basis functions an action dimension
-    :param d_max: longest duration of an option, in s
+    :param d_max: longest duration of an option, in s; ten ``gamma_dt`` by default
     :param d_min: shortest duration, in s; by default one step of the environment
     :param dt: interaction period of the environment, in s; by default found in the environment
+    :param trajectory: how ω becomes actions: ``"rbf"``, the paper's radial basis functions, ``"bezier"``, or a subclass of
+        :class:`~sb3_ctco.options.Trajectory`
+    :param duration_scale: ``"linear"``, the paper's, or ``"log"``, see :class:`~sb3_ctco.options.OptionSpace`
+    :param reward_scale: what R is multiplied by for the critics, a number, or ``"gamma_dt"`` for a unit in which a reward of 1
+        over ``gamma_dt`` is worth 1, as a reward is to SAC at that rate. β_h and temperatures are in the unit of what results
     :param high_freq_penalty: β_h, subtracted once a decision in the critic's target, or a function of the remaining
         progress
     :param target_decision_rate: in Hz, in place of a fixed β_h: ``high_freq_penalty`` is where β_h starts, and it rises
@@ -112,7 +85,12 @@ class CTCO(SoftOptionActorCritic):
     :param target_entropy_anneal: the last fraction of training, in [0, 1], in which both target entropies fall, linearly, by
         one nat a dimension in all: explore first, then get precise; 0 keeps them
     :param duration_learning_rate: step size of d's head; ``learning_rate`` by default
-    :param entropy_reference: ``"uniform"``, ``"paper"`` or ``"duration"``, see :func:`log_reference_density`
+    :param entropy_reference: ``"uniform"``, ``"average"`` or ``"paper"``, see :func:`log_reference_density`
+    :param canonical_weights: whether critics see, in the place of ω, weights that are the same for all options that play the
+        same actions, which makes a difference to options of fewer steps than ``n_rbf``, see
+        :class:`~sb3_ctco.ctco.canonical.CanonicalOptions`
+    :param fast_updates: whether to compute gradients without autograd where that is known to give the same, see
+        :mod:`sb3_ctco.ctco.fast_update`; ``fast_updates_refusal`` says why not where it is not
     :param action_noise: noise added to normalised options while exploring
     :param replay_buffer_class: ``OptionReplayBuffer`` or ``DictOptionReplayBuffer``, or a subclass
     :param replay_buffer_kwargs: keyword arguments for the replay buffer
@@ -125,6 +103,13 @@ class CTCO(SoftOptionActorCritic):
     :param _init_setup_model: whether to build the networks at the creation of the instance
     :raises ValueError: for settings out of range, or that contradict the environment's
     """
+
+    _own_setting: ClassVar[str] = "high_freq_penalty"
+
+    _before_it_was_saved: ClassVar[dict[str, Any]] = {
+        **SoftOptionActorCritic._before_it_was_saved,
+        "canonical_weights": False,
+    }
 
     policy_aliases: ClassVar[dict[str, type[BasePolicy]]] = {
         "MlpPolicy": MlpPolicy,
@@ -153,9 +138,12 @@ class CTCO(SoftOptionActorCritic):
         updates_per_second: float | None = None,
         n_sub_options: int = 8,
         n_rbf: int = 3,
-        d_max: float = 1.0,
+        d_max: float | None = None,
         d_min: float | None = None,
         dt: float | None = None,
+        trajectory: str | type[Trajectory] = "rbf",
+        duration_scale: DurationScale = "linear",
+        reward_scale: float | Literal["gamma_dt"] = 1.0,
         high_freq_penalty: float | Schedule = 0.003,
         target_decision_rate: float | None = None,
         ent_coef: str | float = "auto_0.02",
@@ -165,6 +153,8 @@ class CTCO(SoftOptionActorCritic):
         target_entropy_anneal: float = 0.0,
         duration_learning_rate: float | Schedule | None = None,
         entropy_reference: EntropyReference = "uniform",
+        canonical_weights: bool = True,
+        fast_updates: bool = True,
         action_noise: ActionNoise | None = None,
         replay_buffer_class: type[ReplayBuffer] | None = None,
         replay_buffer_kwargs: dict[str, Any] | None = None,
@@ -180,6 +170,11 @@ class CTCO(SoftOptionActorCritic):
             raise ValueError(f"entropy_reference must be one of {ENTROPY_REFERENCES}, not {entropy_reference!r}")
         if not 0.0 <= target_entropy_anneal <= 1.0:
             raise ValueError(f"target_entropy_anneal must be a fraction of training in [0, 1], not {target_entropy_anneal}")
+        if entropy_reference == "paper" and duration_scale != "linear":
+            raise ValueError(
+                "entropy_reference='paper' is of densities over d in s, so it needs duration_scale='linear', not "
+                f"{duration_scale!r}"
+            )
         if target_decision_rate is not None and not target_decision_rate > 0:
             raise ValueError(f"target_decision_rate must be a positive number of Hz or None, not {target_decision_rate}")
         if target_decision_rate is not None and not (isinstance(high_freq_penalty, int | float) and high_freq_penalty > 0):
@@ -192,9 +187,12 @@ class CTCO(SoftOptionActorCritic):
             env,
             learning_rate,
             n_rbf=n_rbf,
-            d_max=d_max,
+            d_max=_longest(d_max, gamma_dt),
             d_min=d_min,
             dt=dt,
+            trajectory=trajectory,
+            duration_scale=duration_scale,
+            reward_scale=reward_scale,
             gamma=gamma,
             gamma_dt=gamma_dt,
             updates_per_second=updates_per_second,
@@ -222,11 +220,21 @@ class CTCO(SoftOptionActorCritic):
         self.high_freq_penalty = high_freq_penalty
         self.target_decision_rate = target_decision_rate
         self.target_entropy_anneal = target_entropy_anneal
+        self.canonical_weights = canonical_weights
+        self.fast_updates = fast_updates
         self.duration_learning_rate = duration_learning_rate
         self.entropy_reference: EntropyReference = entropy_reference
 
         if _init_setup_model:
             self._setup_model()
+
+    @classmethod
+    def wrapper_kwargs(cls, arguments: dict[str, Any]) -> dict[str, Any]:
+        """OptionExecutionWrapper's arguments for the algorithm's, where environments are made before it.
+
+        :param arguments: the algorithm's arguments, defaults included
+        """
+        return super().wrapper_kwargs({**arguments, "d_max": _longest(arguments["d_max"], arguments["gamma_dt"])})
 
     @staticmethod
     def paper_defaults() -> dict[str, Any]:
@@ -246,26 +254,38 @@ class CTCO(SoftOptionActorCritic):
             "n_sub_options": 0,
             "n_rbf": 3,
             "high_freq_penalty": 0.05,
+            "reward_scale": 1.0,
+            "trajectory": "rbf",
+            "duration_scale": "linear",
             "entropy_reference": "paper",
+            "canonical_weights": False,
             "policy_kwargs": {"n_critics": 1, "net_arch": {"pi": [10, 10], "qf": [64, 64]}},
         }
 
     def _setup_model(self) -> None:
         super()._setup_model()
-        self._duration_lr_schedule = (
-            self.lr_schedule if self.duration_learning_rate is None else FloatSchedule(self.duration_learning_rate)
-        )
-        self._hand_gradients: HandGradients | None = None
+        space = self.option_space
+        #: What makes options canonical for the critics; None where it makes no difference or is not wanted
+        self.canonical_options: CanonicalOptions | None = None
+        if self.canonical_weights and not CanonicalOptions.makes_no_difference(space):
+            self.canonical_options = CanonicalOptions(space, self.device)
+        self._fast_update: FastUpdate | None = None
+        #: Why updates were made with autograd in the last training; None if they were not
+        self.fast_updates_refusal: str | None = None
         if self.target_decision_rate is not None:
             assert isinstance(self.high_freq_penalty, int | float)
             self.log_high_freq_penalty = th.tensor(math.log(self.high_freq_penalty), requires_grad=True)
             self.high_freq_penalty_optimizer = th.optim.Adam([self.log_high_freq_penalty], lr=self.lr_schedule(1))
             #: What the replay buffer had counted at the last training: decisions, and their time in s.
             self._counted_decisions = (0, 0.0)
+        self._last_next_values: tuple[th.Tensor, th.Tensor] | None = None
         assert self.d_min is not None
-        self._log_reference = log_reference_density(self.actor.omega_dim, self.d_min, self.d_max, self.entropy_reference).to(
-            self.device
-        )
+        # Read from the batch where it is "average"
+        self._log_reference: th.Tensor | None = None
+        if self.entropy_reference != "average":
+            self._log_reference = log_reference_density(
+                self.actor.omega_dim, self.d_min, self.d_max, self.entropy_reference, th.zeros(1, 2)
+            ).to(self.device)
 
     def _networks_and_targets(self) -> list[tuple[nn.Module, nn.Module]]:
         return [*super()._networks_and_targets(), (self.actor, self.actor_target)]
@@ -286,28 +306,26 @@ class CTCO(SoftOptionActorCritic):
 
     def _update_learning_rate(self, optimizers: list[th.optim.Optimizer] | th.optim.Optimizer) -> None:
         super()._update_learning_rate(optimizers)
-        self.actor.optimizer.param_groups[1]["lr"] = self._duration_lr_schedule(self._current_progress_remaining)
+        if self.duration_learning_rate is not None:
+            step_size = FloatSchedule(self.duration_learning_rate)(self._current_progress_remaining)
+            self.actor.optimizer.param_groups[1]["lr"] = step_size
 
-    def entropy_costs(self, options: th.Tensor, log_prob: th.Tensor) -> th.Tensor:
+    def entropy_costs(self, log_prob: th.Tensor) -> th.Tensor:
         """β_E log π relative to the reference, ω's and d's with their own temperature.
 
-        :param options: ``[batch, omega_dim + 1]``, normalised
         :param log_prob: log π(ω|s) and log π(d|s) of those, ``[batch, 2]``
         :return: ``[batch, 1]``
         """
-        costs = ((log_prob - self._log_reference) @ self.ent_coefs)[:, None]
-        if self.entropy_reference != "duration":
-            return costs
-        assert self.d_min is not None
-        return costs * duration_weight(options[:, -1:], self.d_min, self.d_max, self.discount_rate)
+        reference = log_prob.mean(dim=0) if self._log_reference is None else self._log_reference
+        return ((log_prob - reference) @ self.ent_coefs)[:, None]
 
     def _sample_policy(self, obs: PyTorchObs) -> tuple[th.Tensor, ...]:
         return self.actor.option_log_prob(obs)
 
     def _critic_targets(self, data: ReplayBufferSamples) -> th.Tensor:
         next_options, next_log_prob = self.actor_target.option_log_prob(data.next_observations)
-        next_q_values = self.critic_target(data.next_observations, next_options)
-        return self._targets(data, next_q_values, self.entropy_costs(next_options, next_log_prob))
+        next_q_values = self.critic_target(data.next_observations, self._as_critics_see(next_options))
+        return self._targets(data, next_q_values, self.entropy_costs(next_log_prob))
 
     def _targets(self, data: ReplayBufferSamples, next_q_values: th.Tensor, next_entropy_costs: th.Tensor) -> th.Tensor:
         """What the critics learn, ``[batch, 1]``.
@@ -316,6 +334,7 @@ class CTCO(SoftOptionActorCritic):
         :param next_entropy_costs: of those, ``[batch, 1]``
         """
         assert data.discounts is not None
+        self._last_next_values = (next_q_values, next_entropy_costs)
         return critic_target(
             data.rewards,
             data.dones,
@@ -327,7 +346,13 @@ class CTCO(SoftOptionActorCritic):
 
     def _actor_loss(self, obs: PyTorchObs, sample: tuple[th.Tensor, ...]) -> th.Tensor:
         options, log_prob = sample
-        return actor_loss(self.critic(obs, options), self.entropy_costs(options, log_prob))
+        return actor_loss(self.critic(obs, self._as_critics_see(options)), self.entropy_costs(log_prob))
+
+    def _q_values(self, data: ReplayBufferSamples) -> th.Tensor:
+        return self.critic(data.observations, self._as_critics_see(data.actions))
+
+    def _as_critics_see(self, options: th.Tensor) -> th.Tensor:
+        return options if self.canonical_options is None else self.canonical_options(options)
 
     def train(self, gradient_steps: int, batch_size: int = 64) -> None:
         """Sample the replay buffer and update temperatures, critics, actor and targets.
@@ -337,38 +362,35 @@ class CTCO(SoftOptionActorCritic):
         """
         if self.target_decision_rate is not None:
             self._update_high_freq_penalty()
-        self._prepare_hand_gradients()
-        try:
-            super().train(gradient_steps, batch_size)
-        finally:  # also what was learned until somebody pressed Ctrl-C
-            if self._hand_gradients is not None:
-                self._hand_gradients.store()
+        super().train(gradient_steps, batch_size)
         self.logger.record("option/high_freq_penalty", self._current_high_freq_penalty())
+        if self._last_next_values is None:
+            return  # A subclass has targets of its own.
+        # What a decision costs beside it, in the last batch: of entropy, and of taking the smallest of the critics' values.
+        next_q_values, next_entropy_costs = self._last_next_values
+        self.logger.record("option/entropy_price", next_entropy_costs.mean().item())
+        self.logger.record("option/critic_spread", (next_q_values.amax(dim=0) - next_q_values.amin(dim=0)).mean().item())
 
-    def _prepare_hand_gradients(self) -> None:
-        # Not possible before the first update, with which optimizers get their state.
-        if not (self._has_own_losses() and HandGradients.possible_for(self)):
-            self._hand_gradients = None
+    @contextlib.contextmanager
+    def _begin_updates(self) -> Iterator[Callable[[ReplayBufferSamples], th.Tensor]]:
+        refusal = FastUpdate.refusal(self) if self.fast_updates else "fast_updates=False"
+        self.logger.record("train/fast_updates", float(refusal is None))
+        if refusal is not None:
+            self._fast_update = None
+            # Before the first update, with which optimizers get their state, there is always a reason.
+            if refusal != self.fast_updates_refusal and self._n_updates > 0 and self.verbose > 0:
+                print(f"Updates are made with autograd: {refusal}")
+            self.fast_updates_refusal = refusal
+            yield self._update
             return
-        if self._hand_gradients is None or not self._hand_gradients.is_valid():
-            self._hand_gradients = HandGradients(self)
-        self._hand_gradients.load()
-
-    def _has_own_losses(self) -> bool:
-        """Whether no subclass changed what the gradients were worked out for."""
-        names = (
-            "_sample_policy",
-            "_critic_targets",
-            "_q_values",
-            "_actor_loss",
-            "_update_temperatures",
-            "_update_targets",
-            "entropy_costs",
-        )
-        return all(getattr(type(self), name) is getattr(CTCO, name) for name in names)
-
-    def _update(self, data: ReplayBufferSamples) -> th.Tensor:
-        return super()._update(data) if self._hand_gradients is None else self._hand_gradients.update(data)
+        self.fast_updates_refusal = None
+        if self._fast_update is None or not self._fast_update.is_valid():
+            self._fast_update = FastUpdate(self)
+        self._fast_update.load()
+        try:
+            yield self._fast_update.update
+        finally:  # also what was learned until somebody pressed Ctrl-C
+            self._fast_update.store()
 
     def _current_high_freq_penalty(self) -> float:
         if self.target_decision_rate is not None:
@@ -417,7 +439,15 @@ class CTCO(SoftOptionActorCritic):
         )
 
     def _excluded_save_params(self) -> list[str]:
-        return [*super()._excluded_save_params(), "actor_target", "_log_reference", "_hand_gradients"]
+        derived = [
+            "actor_target",
+            "canonical_options",
+            "_log_reference",
+            "_last_next_values",
+            "_fast_update",
+            "fast_updates_refusal",
+        ]
+        return [*super()._excluded_save_params(), *derived]
 
     def _get_torch_save_params(self) -> tuple[list[str], list[str]]:
         state_dicts, tensors = super()._get_torch_save_params()

@@ -1,6 +1,8 @@
 """Double Actor-Critic (Zhang and Whiteson 2019, https://arxiv.org/abs/1904.12691) on proximal policy optimisation."""
 
+import io
 import itertools
+import pathlib
 from typing import Any, ClassVar, TypeVar
 
 import numpy as np
@@ -14,6 +16,7 @@ from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, Schedul
 from stable_baselines3.common.utils import FloatSchedule, explained_variance, obs_as_tensor
 from stable_baselines3.common.vec_env import VecEnv
 
+from sb3_ctco.common.load_arguments import check_load_arguments
 from sb3_ctco.dac_ppo.buffers import MDP, MDPS, DACDictRolloutBuffer, DACRolloutBuffer, DACRolloutSamples
 from sb3_ctco.dac_ppo.policies import CnnPolicy, DACPolicy, MlpPolicy, MultiInputPolicy
 from sb3_ctco.options import discount_rate_from_gamma
@@ -162,7 +165,7 @@ class DACPPO(OnPolicyAlgorithm):
         self.dt = dt
         # An explicit dt stays the user's word on any environment; one that was found must be found again.
         self._dt_was_given = dt is not None
-        self.clip_range = clip_range
+        self.clip_range: float | Schedule = clip_range
         self.normalize_advantage = normalize_advantage
         self._updates_due = 0.0
 
@@ -182,7 +185,8 @@ class DACPPO(OnPolicyAlgorithm):
             )
         super()._setup_model()
         self.rollout_buffer.gamma, self.rollout_buffer.gae_lambda = self.step_gamma, self.step_gae_lambda
-        self._clip_range_schedule = FloatSchedule(self.clip_range)
+        # As in Stable-Baselines3's PPO: a function of the remaining progress, whatever was given.
+        self.clip_range = FloatSchedule(self.clip_range)
         self._last_options = np.zeros(self.n_envs, dtype=np.int64)
 
     def _check_env(self, env: VecEnv) -> None:
@@ -218,6 +222,29 @@ class DACPPO(OnPolicyAlgorithm):
         env = self._wrap_env(env, self.verbose)
         self._check_env(env)
         super().set_env(env, force_reset)
+
+    @classmethod
+    def load(
+        cls: type[SelfDACPPO],
+        path: str | pathlib.Path | io.BufferedIOBase,
+        env: GymEnv | None = None,
+        device: th.device | str = "auto",
+        custom_objects: dict[str, Any] | None = None,
+        print_system_info: bool = False,
+        force_reset: bool = True,
+        **kwargs: Any,
+    ) -> SelfDACPPO:
+        """Stable-Baselines3's ``load``.
+
+        :param kwargs: arguments of the constructor to change; all but ``dt`` and ``policy_kwargs``
+        :raises TypeError: for an argument that the constructor does not have
+        :raises ValueError: if the environment's dt differs from the file's, or an argument that cannot be changed
+        """
+        kwargs = check_load_arguments(cls, path, kwargs, ("dt",))
+        # Of two that say the same in different ways, the one that is given holds.
+        if "n_epochs" in kwargs:
+            kwargs.setdefault("updates_per_second", None)
+        return super().load(path, env, device, custom_objects, print_system_info, force_reset, **kwargs)
 
     def _a_step(self, factor: float) -> float:
         """What a factor over ``gamma_dt`` seconds is over one step."""
@@ -341,7 +368,8 @@ class DACPPO(OnPolicyAlgorithm):
         """Update by PPO in both processes, in random order, on the current rollout."""
         self.policy.set_training_mode(True)
         self._update_learning_rate(self.policy.optimizer)
-        clip_range = self._clip_range_schedule(self._current_progress_remaining)
+        assert isinstance(self.clip_range, FloatSchedule)
+        clip_range = self.clip_range(self._current_progress_remaining)
 
         order = MDPS if np.random.rand() < 0.5 else MDPS[::-1]
         for mdp, n_updates in zip(order, self._numbers_of_updates(), strict=True):

@@ -52,7 +52,11 @@ class OptionPredictions:
 
     def __init__(self, policy: "DACPolicy", obs: PyTorchObs):
         self._policy = policy
-        self._features = policy.extract_features(obs, policy.features_extractor)[None]
+        self._obs = obs
+
+    @cached_property
+    def _features(self) -> th.Tensor:
+        return self._policy.extract_features(self._obs, self._policy.features_extractor)[None]
 
     def _of_each_option(self, networks: nn.Sequential) -> th.Tensor:
         return networks(self._features.expand(self._policy.n_options, -1, -1))
@@ -65,7 +69,10 @@ class OptionPredictions:
     @cached_property
     def q_values(self) -> th.Tensor:
         """q(s, o), ``[batch, K]``."""
-        return self._policy.q_network(self._features)[0]
+        if self._policy.share_features_extractor:
+            return self._policy.q_network(self._features)[0]
+        features = self._policy.extract_features(self._obs, self._policy.vf_features_extractor)
+        return self._policy.q_network(features[None])[0]
 
     @cached_property
     def means(self) -> th.Tensor:
@@ -88,18 +95,19 @@ class OptionPredictions:
 
 
 class DACPolicy(BasePolicy):
-    """All networks of double actor-critic: each with a body of its own, on shared features.
+    """All networks of double actor-critic: each with a body of its own, on shared features or with q's own.
 
     :param observation_space: observation space
     :param action_space: action space, a ``Box`` with finite bounds
     :param lr_schedule: learning rate schedule
     :param net_arch: sizes of the hidden layers of each body, or ``dict(pi=..., vf=...)``: π_W's, the options' and their
-        terminations', and q's
+        terminations', and q's; none where one of the two is left out, as in Stable-Baselines3's PPO
     :param activation_fn: activation function
     :param ortho_init: whether to initialise orthogonally
     :param n_options: K
     :param features_extractor_class: features extractor to use
     :param features_extractor_kwargs: keyword arguments of the features extractor
+    :param share_features_extractor: whether q sees the features of the actors, or has an extractor of its own
     :param normalize_images: whether to divide images by 255
     :param optimizer_class: the optimizer to use
     :param optimizer_kwargs: its keyword arguments, without the learning rate; Adam runs fused with ``eps=1e-5`` by default
@@ -119,6 +127,7 @@ class DACPolicy(BasePolicy):
         n_options: int = 4,
         features_extractor_class: type[BaseFeaturesExtractor] = FlattenExtractor,
         features_extractor_kwargs: dict[str, Any] | None = None,
+        share_features_extractor: bool = True,
         normalize_images: bool = True,
         optimizer_class: type[th.optim.Optimizer] = th.optim.Adam,
         optimizer_kwargs: dict[str, Any] | None = None,
@@ -141,14 +150,17 @@ class DACPolicy(BasePolicy):
             normalize_images=normalize_images,
         )
         self.net_arch = [64, 64] if net_arch is None else net_arch
-        if isinstance(self.net_arch, dict) and set(self.net_arch) != {"pi", "vf"}:
+        if isinstance(self.net_arch, dict) and not set(self.net_arch) <= {"pi", "vf"}:
             raise ValueError(f"net_arch must be a list of sizes, or dict(pi=..., vf=...) of such, not {net_arch}")
         self.activation_fn = activation_fn
         self.ortho_init = ortho_init
         self.n_options = n_options
         self.action_dim = math.prod(action_space.shape)
 
+        self.share_features_extractor = share_features_extractor
         self.features_extractor = self.make_features_extractor()
+        if not share_features_extractor:
+            self.vf_features_extractor = self.make_features_extractor()
         #: log π_W up to a constant
         self.master = self._networks("pi", 1, n_options, 0.01)
         self.q_network = self._networks("vf", 1, n_options, 1.0)
@@ -157,13 +169,15 @@ class DACPolicy(BasePolicy):
         self.raw_stds = nn.Parameter(th.zeros(n_options, self.action_dim))
         if ortho_init:
             self.features_extractor.apply(lambda module: self.init_weights(module, math.sqrt(2)))
+            if not share_features_extractor:
+                self.vf_features_extractor.apply(lambda module: self.init_weights(module, math.sqrt(2)))
         self.optimizer = optimizer_class(self.parameters(), lr=lr_schedule(1), **self.optimizer_kwargs)  # type: ignore[call-arg]
 
     def _networks(self, kind: Literal["pi", "vf"], n_members: int, n_outputs: int, head_gain: float) -> nn.Sequential:
         """Networks of one shape, evaluated together."""
         layers: list[nn.Module] = []
         in_features = self.features_extractor.features_dim
-        for out_features in self.net_arch[kind] if isinstance(self.net_arch, dict) else self.net_arch:
+        for out_features in self.net_arch.get(kind, []) if isinstance(self.net_arch, dict) else self.net_arch:
             layers += [EnsembleLinear(n_members, in_features, out_features), self.activation_fn()]
             in_features = out_features
         layers.append(EnsembleLinear(n_members, in_features, n_outputs))
@@ -183,6 +197,7 @@ class DACPolicy(BasePolicy):
             n_options=self.n_options,
             features_extractor_class=self.features_extractor_class,
             features_extractor_kwargs=self.features_extractor_kwargs,
+            share_features_extractor=self.share_features_extractor,
             optimizer_class=self.optimizer_class,
             optimizer_kwargs=self.optimizer_kwargs,
         )
@@ -257,6 +272,13 @@ class DACPolicy(BasePolicy):
         :return: actions, and the state for the next call
         """
         self.set_training_mode(False)
+        # Stable-Baselines3's other policies look for this mistake in BasePolicy.predict, which has no place for a state.
+        given: Any = observation
+        if isinstance(given, tuple) and len(given) == 2 and isinstance(given[1], dict):
+            raise ValueError(
+                "You have passed a tuple to predict: you are probably mixing Gym API with SB3 VecEnv API, "
+                "`obs, info = env.reset()` (Gym) and `obs = vec_env.reset()` (SB3 VecEnv)"
+            )
         obs, is_vectorized = self.obs_to_tensor(observation)
         n = len(next(iter(obs.values()))) if isinstance(obs, dict) else len(obs)
         options = np.zeros(n, dtype=np.int64) if state is None else state[0]

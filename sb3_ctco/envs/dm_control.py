@@ -1,5 +1,7 @@
 """Every task of dm_control's suite at any control period, as a Gymnasium environment that can play whole options."""
 
+import contextlib
+import logging
 import math
 import warnings
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -8,6 +10,8 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 from gymnasium import spaces
+
+from sb3_ctco.wrappers.gymnasium_mujoco import rollout_inputs
 
 try:
     import mujoco
@@ -19,14 +23,14 @@ try:
         from dm_control import suite
         from dm_control.rl.control import PhysicsError
 except ImportError as error:  # pragma: no cover
-    raise ImportError("this environment needs dm_control: pip install 'sb3-ctco[dm-control]'") from error
+    raise ImportError("this environment needs dm_control: in a clone of sb3-ctco, run pip install '.[dm-control]'") from error
 
 #: Rewards ``[n_steps]`` from the qpos, sensordata and ctrl that steps led to, ``[n_steps, ...]`` each
 Rewards = Callable[[np.ndarray, np.ndarray, np.ndarray], np.ndarray]
 
 #: Rewards of the steps that ran, dm_control's discount if the episode ended, and the observations on the way
 _Played = tuple[np.ndarray, float | None, Sequence[np.ndarray] | np.ndarray]
-_STATE = int(mujoco.mjtState.mjSTATE_FULLPHYSICS)
+_STATE, _USER = int(mujoco.mjtState.mjSTATE_FULLPHYSICS), int(mujoco.mjtState.mjSTATE_USER)
 
 
 class DMControlEnv(gym.Env[np.ndarray, np.ndarray]):
@@ -78,11 +82,14 @@ class DMControlEnv(gym.Env[np.ndarray, np.ndarray]):
             raise ValueError(f"render_mode must be None or 'rgb_array', not {render_mode!r}")
         if sparse and domain not in _SPARSE_REWARDS:
             raise ValueError(f"{domain} has no sparse reward here; these domains have one: {sorted(_SPARSE_REWARDS)}")
-        env = suite.load(domain, task)
+        with _without_deprecations():
+            # Some models are drawn at random (lqr's): the same one each time. What reset draws follows from its seed.
+            env = suite.load(domain, task, task_kwargs={"random": 0})
         self._task = env.task
         self._physics = env.physics
         self._model: mujoco.MjModel = env.physics.model.ptr
         self._data: mujoco.MjData = env.physics.data.ptr
+        self._name = (domain, task, sparse)
         self._uses_rk4 = self._model.opt.integrator == mujoco.mjtIntegrator.mjINT_RK4
 
         #: Control period, in s
@@ -95,8 +102,7 @@ class DMControlEnv(gym.Env[np.ndarray, np.ndarray]):
         self._step_limit = limit if math.isinf(limit) else max(1, round(limit / self.dt))
         self._steps_left: float = 0
 
-        make_rewards = _SPARSE_REWARDS.get(domain) if sparse else _REWARDS.get((domain, task))
-        self._rewards: Rewards | None = make_rewards(self._model, self._data) if make_rewards else None
+        self._rewards = self._make_rewards()
         self._first_joint = _FIRST_JOINTS.get(domain, 0)
         self._rollout = Rollout(nthread=0)
 
@@ -189,19 +195,20 @@ class DMControlEnv(gym.Env[np.ndarray, np.ndarray]):
         leaves them, repeats mj_step1 once and is otherwise the same.
         """
         model, data, n_sub_steps = self._model, self._data, self._n_sub_steps
-        ctrl = np.repeat(np.asarray(actions, dtype=np.float64)[None], n_sub_steps, axis=1)
+        inputs = rollout_inputs(model, data, actions, n_sub_steps)
         start = np.empty((1, mujoco.mj_stateSize(model, _STATE)))
         mujoco.mj_getState(model, data, start[0], _STATE)
-        states = np.empty((1, ctrl.shape[1], start.shape[1]))
+        states = np.empty((1, inputs.shape[1], start.shape[1]))
         # The sensors of a step are those of the state that it starts in; the last state's are read from the data.
-        sensors = np.empty((1, ctrl.shape[1] + 1, model.nsensordata))
+        sensors = np.empty((1, inputs.shape[1] + 1, model.nsensordata))
         self._rollout.rollout(
             [model],
             [data],
             start,
-            ctrl,
+            inputs,
+            control_spec=_USER,
             skip_checks=True,
-            nstep=ctrl.shape[1],
+            nstep=inputs.shape[1],
             initial_warmstart=data.qacc_warmstart[None].copy(),
             state=states,
             sensordata=sensors[:, :-1],
@@ -211,7 +218,8 @@ class DMControlEnv(gym.Env[np.ndarray, np.ndarray]):
         # A full state is time, qpos, qvel, …
         joints = states[0, n_sub_steps - 1 :: n_sub_steps, 1 : 1 + model.nq + model.nv]
         assert self._rewards is not None
-        rewards = self._rewards(joints[:, : model.nq], sensors[0, n_sub_steps::n_sub_steps], ctrl[0, ::n_sub_steps])
+        ctrl = inputs[0, ::n_sub_steps, : model.nu]
+        rewards = self._rewards(joints[:, : model.nq], sensors[0, n_sub_steps::n_sub_steps], ctrl)
         return rewards, None, list(joints[[k - 1 for k in observe], self._first_joint :].astype(np.float32))
 
     def render(self) -> np.ndarray | None:  # type: ignore[override]
@@ -222,12 +230,46 @@ class DMControlEnv(gym.Env[np.ndarray, np.ndarray]):
         """Free the renderer and the simulation."""
         self._physics.free()
 
+    def _make_rewards(self) -> Rewards | None:
+        domain, task, sparse = self._name
+        make_rewards = _SPARSE_REWARDS.get(domain) if sparse else _REWARDS.get((domain, task))
+        if make_rewards is None:
+            return None
+        # In the model's own position, so that the same numbers come out whatever the episode is at.
+        data = mujoco.MjData(self._model)
+        mujoco.mj_forward(self._model, data)
+        return make_rewards(self._model, data)
+
+    def __getstate__(self) -> dict[str, Any]:
+        # What refers to the simulation's memory is made anew.
+        return {name: value for name, value in vars(self).items() if name not in ("_model", "_data", "_rewards", "_rollout")}
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        vars(self).update(state)
+        self._model, self._data = self._physics.model.ptr, self._physics.data.ptr
+        self._rewards, self._rollout = self._make_rewards(), Rollout(nthread=0)
+
     def _flat_observation(self) -> np.ndarray:
         if self._rewards is not None:
             joints = (self._data.qpos[self._first_joint :], self._data.qvel)
             return np.concatenate(joints, dtype=np.float32, casting="same_kind")
         leaves = [np.ravel(value) for value in _leaves(self._task.get_observation(self._physics))]
         return np.concatenate(leaves, dtype=np.float32, casting="same_kind")
+
+
+@contextlib.contextmanager
+def _without_deprecations() -> Iterator[None]:
+    """Keep to itself what MuJoCo says of attributes in dm_control's own models, which its users cannot change."""
+    logger = logging.getLogger("absl")
+
+    def is_wanted(record: logging.LogRecord) -> bool:
+        return "'settotalmass' is deprecated" not in record.getMessage()
+
+    logger.addFilter(is_wanted)
+    try:
+        yield
+    finally:
+        logger.removeFilter(is_wanted)
 
 
 def _leaves(observation: Mapping[str, Any]) -> Iterator[Any]:

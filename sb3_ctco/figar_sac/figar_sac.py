@@ -12,7 +12,8 @@ from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, PyTorchObs, ReplayBufferSamples, Schedule
 from stable_baselines3.common.vec_env import VecEnv
 
-from sb3_ctco.common.soft_actor_critic import SoftOptionActorCritic, critic_target
+from sb3_ctco.common.losses import critic_target, repeated_actor_loss, repetition_values
+from sb3_ctco.common.soft_actor_critic import SoftOptionActorCritic
 from sb3_ctco.figar_sac.policies import (
     CnnPolicy,
     FiGARActor,
@@ -23,41 +24,10 @@ from sb3_ctco.figar_sac.policies import (
     decode_repetitions,
     encode_repetitions,
 )
-from sb3_ctco.options import OptionSettings, steps_in
+from sb3_ctco.options import OptionSpace, steps_in
 from sb3_ctco.wrappers import OptionExecutionWrapper, find_dt
 
 SelfFiGARSAC = TypeVar("SelfFiGARSAC", bound="FiGARSAC")
-
-
-def repetition_values(q_values: th.Tensor, repetition_log_probs: th.Tensor, duration_ent_coef: th.Tensor) -> th.Tensor:
-    """Σ_k π_x(k|s)·(min_i Q_i(s, a)_k − α_x log π_x(k|s)): the exact expectation over repetitions.
-
-    :param q_values: Q_i(s, a)_k, ``[n_critics, batch, K]``
-    :param repetition_log_probs: log π_x(k|s), ``[batch, K]``
-    :param duration_ent_coef: α_x, a scalar
-    :return: ``[batch, 1]``
-    """
-    soft_values = q_values.amin(dim=0) - duration_ent_coef * repetition_log_probs
-    return (repetition_log_probs.exp() * soft_values).sum(dim=1, keepdim=True)
-
-
-def actor_loss(
-    q_values: th.Tensor, action_log_prob: th.Tensor, repetition_log_probs: th.Tensor, ent_coefs: th.Tensor
-) -> th.Tensor:
-    """L_a + L_x, each part of the policy judged with the other one held fixed.
-
-    L_a = α_a log π_a(a|s) − Σ_k sg[π_x(k|s)]·min_i Q_i(s, a)_k moves the action, and
-    L_x = Σ_k π_x(k|s)·(α_x log π_x(k|s) − sg[min_i Q_i(s, a)_k]) the repetition; sg stops gradients.
-
-    :param q_values: Q_i(s, a)_k of reparameterised actions, ``[n_critics, batch, K]``
-    :param action_log_prob: log π_a(a|s), ``[batch]``
-    :param repetition_log_probs: log π_x(k|s), ``[batch, K]``
-    :param ent_coefs: α_a and α_x, ``[2]``
-    """
-    repetition_probs = repetition_log_probs.exp()
-    loss_a = ent_coefs[0] * action_log_prob - (repetition_probs.detach() * q_values.amin(dim=0)).sum(dim=1)
-    loss_x = -repetition_values(q_values.detach(), repetition_log_probs, ent_coefs[1])
-    return loss_a.mean() + loss_x.mean()
 
 
 class FiGARSAC(SoftOptionActorCritic):
@@ -107,6 +77,8 @@ class FiGARSAC(SoftOptionActorCritic):
     :raises ValueError: for settings out of range, or that contradict each other or the environment's
     :raises TypeError: if ``n_repetitions`` is not an integer
     """
+
+    _own_setting: ClassVar[str] = "n_repetitions"
 
     policy_aliases: ClassVar[dict[str, type[BasePolicy]]] = {
         "MlpPolicy": MlpPolicy,
@@ -215,7 +187,7 @@ class FiGARSAC(SoftOptionActorCritic):
             )
         if d_max is None:
             d_max = (20 if n_repetitions is None else n_repetitions) * dt
-        return super().wrapper_kwargs({**arguments, "n_rbf": 1, "d_max": d_max, "d_min": None})
+        return super().wrapper_kwargs({**arguments, "n_rbf": 1, "d_max": d_max, "d_min": None, "duration_scale": "linear"})
 
     def _resolve_repetitions(self, dt: float) -> None:
         """Make ``n_repetitions`` and ``d_max``, of which the user gave one, say the same at the first dt that is known."""
@@ -241,12 +213,12 @@ class FiGARSAC(SoftOptionActorCritic):
         if self.dt is not None:
             self._resolve_repetitions(self.dt)
         elif isinstance(env, VecEnv):
-            self._resolve_repetitions(env.get_attr("option_settings")[0].dt)
+            self._resolve_repetitions(env.get_attr("option_space")[0].dt)
         else:
-            self._resolve_repetitions(env.get_wrapper_attr("option_settings").dt)
+            self._resolve_repetitions(env.get_wrapper_attr("option_space").dt)
         return env
 
-    def _check_env(self, env: VecEnv) -> OptionSettings:
+    def _check_env(self, env: VecEnv) -> OptionSpace:
         settings = super()._check_env(env)
         if not np.isclose(settings.d_min, settings.dt, rtol=1e-6, atol=0.0):
             raise ValueError(
@@ -274,21 +246,13 @@ class FiGARSAC(SoftOptionActorCritic):
             action[:, -1] = buffer_action[:, -1] = encode_repetitions(index + 1.0, self.n_repetitions)
         return action, buffer_action
 
-    def _store_transition(
-        self,
-        replay_buffer: ReplayBuffer,
-        buffer_action: np.ndarray,
-        new_obs: np.ndarray | dict[str, np.ndarray],
-        reward: np.ndarray,
-        dones: np.ndarray,
-        infos: list[dict[str, Any]],
-    ) -> None:
+    def _see_what_ran(self, options: np.ndarray, infos: list[dict[str, Any]]) -> None:
         # What ran is what was asked for, unless the episode's end cut it short: then it equals a shorter repetition.
         assert self.n_repetitions is not None
-        n_steps = np.array([info["option"]["n_steps"] for info in infos], dtype=np.float32)
-        buffer_action = buffer_action.copy()
-        buffer_action[:, -1] = encode_repetitions(n_steps, self.n_repetitions)
-        super()._store_transition(replay_buffer, buffer_action, new_obs, reward, dones, infos)
+        for option, info in zip(options, infos, strict=True):
+            if "option" in info:
+                n_steps = np.array(info["option"]["n_steps"], dtype=np.float32)
+                option[-1] = encode_repetitions(n_steps, self.n_repetitions)
 
     def _sample_policy(self, obs: PyTorchObs) -> tuple[th.Tensor, ...]:
         actions, action_log_prob, repetition_log_probs = self.actor.action_log_prob(obs)
@@ -318,7 +282,7 @@ class FiGARSAC(SoftOptionActorCritic):
 
     def _actor_loss(self, obs: PyTorchObs, sample: tuple[th.Tensor, ...]) -> th.Tensor:
         actions, log_prob, repetition_log_probs = sample
-        return actor_loss(self.critic(obs, actions), log_prob[:, 0], repetition_log_probs, self.ent_coefs)
+        return repeated_actor_loss(self.critic(obs, actions), log_prob[:, 0], repetition_log_probs, self.ent_coefs)
 
     def learn(
         self: SelfFiGARSAC,

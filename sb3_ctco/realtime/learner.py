@@ -18,9 +18,9 @@ import torch as th
 from stable_baselines3.common.logger import Logger
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 
+from sb3_ctco.options import SubOptions
 from sb3_ctco.realtime.journal import Arrays, JournalError, JournalReader
 from sb3_ctco.realtime.weights import SharedWeights
-from sb3_ctco.wrappers import SubOptions
 
 #: An update's share of a round is kept below this, so that a round can be stopped in time; in s
 _ROUND_SECONDS = 0.1

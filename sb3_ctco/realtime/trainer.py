@@ -13,7 +13,6 @@ import time
 from collections import deque
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from dataclasses import asdict
 from pathlib import Path
 from typing import Any, Generic, TypeVar
 
@@ -445,7 +444,7 @@ def _meaning(model: OffPolicyAlgorithm) -> dict[str, Any]:
     actions: Any = model.primitive_action_space if is_option else model.action_space
     return {
         "algorithm": type(model).__name__,
-        "options": asdict(model.option_settings) if is_option else None,
+        "options": {name: str(value) for name, value in model.option_space.arguments.items()} if is_option else None,
         "actions": {"low": actions.low.tolist(), "high": actions.high.tolist()},
         "observations": {name: [list(leaf.shape or ()), str(leaf.dtype)] for name, leaf in leaves.items()},
     }

@@ -23,7 +23,14 @@ def main(arguments: Sequence[str] | None = None) -> int:
     args = _parser().parse_args(arguments)
     try:
         return args.call(args)
-    except (ValueError, ImportError) as error:
+    except ModuleNotFoundError as error:
+        missing = (error.name or str(error)).partition(".")[0]
+        print(
+            f"sb3-ctco study {args.command}: {missing} is missing: in a clone of sb3-ctco, run pip install '.[study]'",
+            file=sys.stderr,
+        )
+        return FAILED
+    except (ValueError, ImportError, OSError) as error:  # an OSError is a file or folder that cannot be read or written
         print(f"sb3-ctco study {args.command}: {error}", file=sys.stderr)
         return FAILED
 

@@ -120,7 +120,7 @@ def run_on_ray(runs: Sequence[Run], folder: Path, workers: int, address: str | N
     try:
         import ray  # noqa: PLC0415
     except ImportError as error:
-        raise ImportError("--engine ray needs Ray: pip install 'sb3-ctco[ray]'") from error
+        raise ImportError("--engine ray needs Ray: in a clone of sb3-ctco, run pip install '.[ray]'") from error
 
     ray.init(
         address=address,

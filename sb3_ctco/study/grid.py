@@ -3,6 +3,8 @@
 import dataclasses
 import hashlib
 import json
+import math
+import re
 from collections.abc import Sequence
 from dataclasses import dataclass
 from importlib import resources
@@ -11,13 +13,10 @@ from typing import Any
 
 import yaml
 
-from sb3_ctco.envs import STUDY_RATES
+from sb3_ctco.registry import ALGORITHMS, find_task
 
-#: Tasks by their names in records, and what they are called in the ids of environments
-TASKS = {"point_mass": "point_mass-sparse", "cheetah": "cheetah-run", "ball_in_cup": "ball_in_cup-catch"}
-ALGORITHMS = ("ctco", "sac", "figar_sac", "dac_ppo")
-#: Length of an episode, in s
-EPISODE_SECONDS = 10.0
+#: What the name of a setting may be: it becomes part of the name of a folder
+_SETTING = re.compile(r"\w[\w.+-]*", re.ASCII)
 
 
 @dataclass(frozen=True)
@@ -25,14 +24,15 @@ class Run:
     """One run: everything that its result depends on, except for the versions of what it is made with.
 
     :param preset: name of the preset that it belongs to
-    :param task: ``"point_mass"``, ``"cheetah"`` or ``"ball_in_cup"``
-    :param algorithm: ``"ctco"``, ``"sac"``, ``"figar_sac"`` or ``"dac_ppo"``
+    :param task: of :mod:`sb3_ctco.registry`, or an id of Gymnasium's registry
+    :param algorithm: of :mod:`sb3_ctco.registry`
     :param setting: name of the algorithm's arguments, such as ``"paper"`` or ``"tuned"``
     :param rate: interaction rate, in Hz
     :param seed: of the algorithm and the environment
     :param task_seconds: how long to learn, in s of task time
-    :param eval_episodes: number of greedy episodes at the end
-    :param arguments: the algorithm's, as in the preset file
+    :param eval_episodes: number of greedy episodes of an evaluation
+    :param arguments: the algorithm's, as in the preset file, and what the task says of them
+    :param evaluations: how many evaluations to make, evenly in the last tenth of task time, the last at its end
     """
 
     preset: str
@@ -44,6 +44,7 @@ class Run:
     task_seconds: float
     eval_episodes: int
     arguments: dict[str, Any]
+    evaluations: int = 1
 
     @property
     def dt(self) -> float:
@@ -51,14 +52,9 @@ class Run:
         return 1.0 / self.rate
 
     @property
-    def env_id(self) -> str:
-        """Id of the environment in Gymnasium's registry."""
-        return f"sb3_ctco/{TASKS[self.task]}-{self.rate}hz-v0"
-
-    @property
     def name(self) -> str:
         """Name of the run's folder."""
-        return f"{self.task}-{self.algorithm}_{self.setting}-{self.rate}hz-seed{self.seed}"
+        return f"{self.task.replace('/', '_')}-{self.algorithm}_{self.setting}-{self.rate}hz-seed{self.seed}"
 
     @property
     def fingerprint(self) -> str:
@@ -67,7 +63,10 @@ class Run:
 
     def as_dict(self) -> dict[str, Any]:
         """The settings, as they are kept in the run's folder."""
-        return dataclasses.asdict(self)
+        settings = dataclasses.asdict(self)
+        if self.evaluations == 1:
+            del settings["evaluations"]  # Runs were recorded without it.
+        return settings
 
 
 @dataclass(frozen=True)
@@ -131,47 +130,95 @@ def load_preset(name: str) -> Preset:
     :raises ValueError: if there is none, or something in it is not as it must be
     """
     if name in preset_names():
-        text = (resources.files("sb3_ctco.study") / "presets" / f"{name}.yml").read_text(encoding="utf-8")
+        content = (resources.files("sb3_ctco.study") / "presets" / f"{name}.yml").read_bytes()
     elif Path(name).is_file():
-        text, name = Path(name).read_text(encoding="utf-8"), Path(name).stem
+        content, name = Path(name).read_bytes(), Path(name).stem
     else:
         raise ValueError(f"there is no preset {name!r}: name one of {preset_names()}, or a YAML file")
-    return Preset(name, tuple(_grid(name, yaml.safe_load(text))))
+    try:
+        parsed = yaml.safe_load(content)
+    except (yaml.YAMLError, ValueError) as error:  # a date that there is not is a ValueError
+        raise ValueError(f"preset {name} is no YAML: {error}") from error
+    return Preset(name, tuple(_grid(name, parsed)))
+
+
+_TASK_KEYS = ("rates", "task_seconds", "eval_episodes", "evaluations", "arguments")
 
 
 def _grid(preset: str, content: Any) -> list[Run]:
-    _check_keys(
-        f"preset {preset}", content, ("task_seconds", "eval_episodes", "tasks", "rates", "seeds", "algorithms"), optional=()
-    )
-    _check_values(preset, "tasks", content["tasks"], tuple(TASKS))
-    _check_values(preset, "rates", content["rates"], STUDY_RATES)
-    for name in ("seeds", "eval_episodes"):
-        if not (isinstance(content[name], int) and content[name] >= 1):
-            raise ValueError(f"preset {preset}: {name} must be a whole number from 1, not {content[name]!r}")
-    task_seconds = content["task_seconds"]
-    if not (isinstance(task_seconds, int | float) and task_seconds >= 10 * EPISODE_SECONDS):
-        raise ValueError(
-            f"preset {preset}: task_seconds must be at least {10 * EPISODE_SECONDS:g}, so that an episode of "
-            f"{EPISODE_SECONDS:g} s ends in the last tenth, not {task_seconds!r}"
-        )
-    entries = []
-    for name, entry in content["algorithms"].items():
-        where = f"preset {preset}, algorithm {name}"
-        _check_keys(where, entry, ("setting", "arguments"), optional=("algorithm",))
-        algorithm = entry.get("algorithm", name)
-        if algorithm not in ALGORITHMS:
-            raise ValueError(f"{where}: must be one of {ALGORITHMS}, or name one of them as its algorithm, not {algorithm!r}")
-        entries.append((algorithm, str(entry["setting"]), dict(entry["arguments"])))
-    names = [entry[:2] for entry in entries]
-    if len(set(names)) < len(names):
-        raise ValueError(f"preset {preset}: two entries have the same algorithm and setting, in {names}")
+    where = f"preset {preset}"
+    _check_keys(where, content, ("task_seconds", "eval_episodes", "tasks", "rates", "seeds", "algorithms"), ("evaluations",))
+    tasks = content["tasks"]
+    if isinstance(tasks, list):
+        tasks = {find_task(name).name: {} for name in tasks} if len(set(map(str, tasks))) == len(tasks) else None
+    if not (isinstance(tasks, dict) and tasks):
+        raise ValueError(f"{where}: tasks must be a list of tasks, each once, or a mapping, not {content['tasks']!r}")
+    entries = _entries(where, content["algorithms"])
+    _check_whole(where, "seeds", content["seeds"])
+    # What the preset says of every task, and a task for itself
+    shared = {name: content[name] for name in ("rates", "task_seconds", "eval_episodes", "evaluations") if name in content}
+    cells = []
+    for name, own in tasks.items():
+        of_task = f"{where}, task {name}"
+        task = find_task(name)
+        _check_keys(of_task, own or {}, (), _TASK_KEYS)
+        settings = {"evaluations": 1, **shared, **(own or {})}
+        _check_rates(of_task, settings["rates"])
+        _check_whole(of_task, "eval_episodes", settings["eval_episodes"])
+        _check_whole(of_task, "evaluations", settings["evaluations"])
+        for rate in settings["rates"]:
+            _check_seconds(of_task, settings["task_seconds"], task.seconds_of_episode(rate))
+            cells.append((rate, name, settings))
+    # Sorting keeps the order of the tasks at a rate.
+    cells.sort(key=lambda cell: -cell[0])
     return [
-        Run(preset, task, algorithm, setting, rate, seed, float(task_seconds), content["eval_episodes"], arguments)
+        Run(
+            preset,
+            name,
+            algorithm,
+            setting,
+            rate,
+            seed,
+            float(settings["task_seconds"]),
+            settings["eval_episodes"],
+            {**arguments, **_checked_arguments(f"{where}, task {name}", settings.get("arguments", {}))},
+            settings["evaluations"],
+        )
         for seed in range(content["seeds"])
-        for rate in sorted(content["rates"], reverse=True)
-        for task in content["tasks"]
+        for rate, name, settings in cells
         for algorithm, setting, arguments in entries
     ]
+
+
+def _entries(where: str, algorithms: Any) -> list[tuple[str, str, dict[str, Any]]]:
+    """Algorithms with their settings and arguments."""
+    if not (isinstance(algorithms, dict) and algorithms):
+        raise ValueError(f"{where}: algorithms must be a mapping of names to setting and arguments, not {algorithms!r}")
+    entries = []
+    for name, entry in algorithms.items():
+        of_entry = f"{where}, algorithm {name}"
+        _check_keys(of_entry, entry, ("setting", "arguments"), optional=("algorithm",))
+        algorithm, setting = entry.get("algorithm", name), str(entry["setting"])
+        if algorithm not in list(ALGORITHMS):
+            raise ValueError(
+                f"{of_entry}: must be one of {list(ALGORITHMS)}, or name one of them as its algorithm, not {algorithm!r}"
+            )
+        if entry["setting"] is None or not _SETTING.fullmatch(setting):
+            raise ValueError(
+                f"{of_entry}: setting becomes part of a folder's name, so it must be of letters, digits and _ . + -, not "
+                f"{entry['setting']!r}"
+            )
+        entries.append((algorithm, setting, _checked_arguments(of_entry, entry["arguments"])))
+    names = [entry[:2] for entry in entries]
+    if len(set(names)) < len(names):
+        raise ValueError(f"{where}: two entries have the same algorithm and setting, in {names}")
+    return entries
+
+
+def _checked_arguments(where: str, arguments: Any) -> dict[str, Any]:
+    if not (isinstance(arguments, dict) and all(isinstance(name, str) for name in arguments)):
+        raise ValueError(f"{where}: arguments must be a mapping of names to values ({{}} for none), not {arguments!r}")
+    return dict(arguments)
 
 
 def _check_keys(where: str, content: Any, required: Sequence[str], optional: Sequence[str]) -> None:
@@ -179,9 +226,29 @@ def _check_keys(where: str, content: Any, required: Sequence[str], optional: Seq
         raise ValueError(f"{where}: must be a mapping with {[*required, *optional]}, not {content!r}")
     missing, unknown = set(required) - set(content), set(content) - {*required, *optional}
     if missing or unknown:
-        raise ValueError(f"{where}: {sorted(missing)} missing, {sorted(unknown)} unknown; it has {[*required, *optional]}")
+        raise ValueError(
+            f"{where}: {sorted(missing)} missing, {sorted(unknown, key=str)} unknown; it has {[*required, *optional]}"
+        )
 
 
-def _check_values(preset: str, name: str, given: Any, allowed: tuple[Any, ...]) -> None:
-    if not (isinstance(given, list) and given and set(given) <= set(allowed) and len(set(given)) == len(given)):
-        raise ValueError(f"preset {preset}: {name} must be a list of some of {allowed}, each once, not {given!r}")
+def _check_rates(where: str, rates: Any) -> None:
+    if not (isinstance(rates, list) and rates and all(map(_is_whole, rates)) and len(set(rates)) == len(rates)):
+        raise ValueError(f"{where}: rates must be a list of whole numbers of Hz, each once, not {rates!r}")
+
+
+def _check_whole(where: str, name: str, value: Any) -> None:
+    if not _is_whole(value):
+        raise ValueError(f"{where}: {name} must be a whole number from 1, not {value!r}")
+
+
+def _check_seconds(where: str, task_seconds: Any, episode_seconds: float) -> None:
+    shortest = 10 * episode_seconds
+    if isinstance(task_seconds, bool) or not (isinstance(task_seconds, int | float) and shortest <= task_seconds < math.inf):
+        raise ValueError(
+            f"{where}: task_seconds must be at least {shortest:g}, so that an episode of {episode_seconds:g} s ends in the "
+            f"last tenth, and finite, not {task_seconds!r}"
+        )
+
+
+def _is_whole(value: Any) -> bool:
+    return isinstance(value, int) and not isinstance(value, bool) and value >= 1

@@ -9,21 +9,18 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from sb3_ctco.options import DEFAULT_DISCOUNT_RATE
-from sb3_ctco.study.grid import ALGORITHMS, TASKS
+from sb3_ctco.registry import ALGORITHMS, TASKS, find_task
 from sb3_ctco.study.records import CURVE_EPISODES, Record, key, paper_returns, read_curves, read_records
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-ALGORITHM_NAMES = {"ctco": "CTCO", "sac": "SAC", "figar_sac": "FiGAR-SAC", "dac_ppo": "DAC-PPO"}
-TASK_NAMES = {"point_mass": "sparse point mass", "cheetah": "cheetah run", "ball_in_cup": "ball in cup"}
 METRICS = {
     "discounted_return": "discounted return,\ntraining episodes of the last tenth",
     "greedy_return": "discounted return,\ngreedy episodes",
     "decision_rate_hz": "decisions a second,\ntraining episodes of the last tenth",
 }
-_COLOURS = dict(zip(ALGORITHMS, ("C0", "C1", "C2", "C3"), strict=True))
 _DASHES = ("-", "-.", ":")
 #: Resamples of the bootstrap, as many as rliable's authors take for figures
 _BOOTSTRAP_REPETITIONS = 2000
@@ -55,12 +52,13 @@ def by_line(records: Sequence[Record], task: str, metric: str) -> dict[Line, dic
 def lines_of(records: Sequence[Record]) -> list[Line]:
     """Algorithms and settings that occur, in a fixed order; the paper's settings come after others."""
     present = {_line_of(record) for record in records}
-    return sorted(present, key=lambda line: (ALGORITHMS.index(line[0]), line[1] == "paper", line[1]))
+    return sorted(present, key=lambda line: (list(ALGORITHMS).index(line[0]), line[1] == "paper", line[1]))
 
 
 def tasks_of(records: Sequence[Record]) -> list[str]:
-    """Tasks that occur, in the paper's order."""
-    return [task for task in TASKS if any(record["task"] == task for record in records)]
+    """Tasks that occur: the paper's in its order, and then others."""
+    present = {record["task"] for record in records}
+    return [*(task for task in TASKS if task in present), *sorted(present - set(TASKS))]
 
 
 def interquartile_means(records: Sequence[Record], metric: str) -> Estimates:
@@ -110,16 +108,16 @@ def draw_metric(records: Sequence[Record], metric: str) -> "Figure":
             _line_with_intervals(ax, list(rates), means, means - half_widths, means + half_widths, line, lines)
             for x, values in zip(_apart(list(rates), line, lines), rates.values(), strict=True):
                 if len(values) > 1:
-                    ax.plot([x] * len(values), values, ".", color=_COLOURS[line[0]], markersize=3)
+                    ax.plot([x] * len(values), values, ".", color=ALGORITHMS[line[0]].colour, markersize=3)
                 shown += values
         for algorithm in ALGORITHMS:
             if numbers := paper.get((task, algorithm)):
                 shown += numbers.values()
-                label = f"{ALGORITHM_NAMES[algorithm]}, the paper's figure"
-                colour = _COLOURS[algorithm]
+                label = f"{ALGORITHMS[algorithm].label}, the paper's figure"
+                colour = ALGORITHMS[algorithm].colour
                 ax.plot(list(numbers), list(numbers.values()), "--", color=colour, linewidth=0.8, alpha=0.7, label=label)
         _rate_axis(ax, records)
-        ax.set_title(TASK_NAMES[task])
+        ax.set_title(find_task(task).label)
         if metric == "decision_rate_hz":
             ax.set_yscale("log")
         else:
@@ -181,7 +179,7 @@ def draw_learning_curves(points: Sequence[Record]) -> "Figure":
                     low, high = means - half_widths, means + half_widths
                     ax.fill_between(minutes, low, high, where=several, color=style["color"], alpha=0.15, linewidth=0)
                 shown += means.tolist()
-            ax.set_title(f"{TASK_NAMES[task]}, {rate} Hz")
+            ax.set_title(f"{find_task(task).label}, {rate} Hz")
             _return_axis(ax, shown)
         row[0].set_ylabel("discounted return")
     for ax in axes[-1]:
@@ -215,12 +213,16 @@ def table(records: Sequence[Record], estimates: dict[str, Estimates]) -> str:
                 numbers = sorted({len(one) for one in values.values()})
                 seeds = "–".join(str(number) for number in {numbers[0]: 0, numbers[-1]: 0})
                 cells = (_cell(values.get(rate, [])) for rate in rates)
-                parts.append(_row(TASK_NAMES[task], ALGORITHM_NAMES[algorithm], setting, seeds, *cells))
+                parts.append(_row(find_task(task).label, ALGORITHMS[algorithm].label, setting, seeds, *cells))
             if metric != "decision_rate_hz":
                 for algorithm in ALGORITHMS:
-                    numbers_of_paper = paper_returns()[task, algorithm]
-                    cells = (f"{numbers_of_paper[rate]:.2f}" for rate in rates)
-                    parts.append(_row(TASK_NAMES[task], ALGORITHM_NAMES[algorithm], "*the paper's figure*", "30", *cells))
+                    numbers_of_paper = paper_returns().get((task, algorithm))
+                    if numbers_of_paper is None:
+                        continue
+                    cells = (f"{numbers_of_paper[rate]:.2f}" if rate in numbers_of_paper else "–" for rate in rates)
+                    parts.append(
+                        _row(find_task(task).label, ALGORITHMS[algorithm].label, "*the paper's figure*", "30", *cells)
+                    )
         parts.append("")
     parts.append("## Interquartile means\n")
     parts.append(
@@ -233,7 +235,7 @@ def table(records: Sequence[Record], estimates: dict[str, Estimates]) -> str:
         name = {"discounted_return": "training", "greedy_return": "greedy"}[metric]
         for (algorithm, setting), of_rates in of_lines.items():
             cells = (_interval_cell(of_rates.get(rate)) for rate in rates)
-            parts.append(_row(name, ALGORITHM_NAMES[algorithm], setting, *cells))
+            parts.append(_row(name, ALGORITHMS[algorithm].label, setting, *cells))
     return "\n".join(parts) + "\n"
 
 
@@ -298,8 +300,8 @@ def _panels(n_rows: int, n_columns: int) -> tuple["Figure", np.ndarray]:
 def _style(line: Line, lines: Sequence[Line]) -> tuple[dict[str, Any], str]:
     algorithm, setting = line
     settings = [other for name, other in lines if name == algorithm]
-    style = {"color": _COLOURS[algorithm], "linestyle": _DASHES[settings.index(setting) % len(_DASHES)]}
-    return style, f"{ALGORITHM_NAMES[algorithm]} ({setting})"
+    style = {"color": ALGORITHMS[algorithm].colour, "linestyle": _DASHES[settings.index(setting) % len(_DASHES)]}
+    return style, f"{ALGORITHMS[algorithm].label} ({setting})"
 
 
 def _line_with_intervals(

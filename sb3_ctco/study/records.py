@@ -13,7 +13,8 @@ from sb3_ctco.study.runs import MONITOR, RECORD, SETTINGS, write_whole
 
 Record = dict[str, Any]
 
-#: Columns of the CSV file, and what their values are. ``dt`` and seconds are in s, returns in reward rate × s, rates in Hz.
+#: Columns of the CSV file, and what their values are. ``dt`` and seconds are in s, rates in Hz, ``discounted_return`` and
+#: ``greedy_return`` in reward rate × s; ``episode_return`` and ``greedy_episode_return`` are plain sums of rewards.
 COLUMNS: dict[str, type] = {
     "task": str,
     "algorithm": str,
@@ -28,6 +29,8 @@ COLUMNS: dict[str, type] = {
     "preset": str,
     "setting": str,
     "greedy_decision_rate_hz": float,
+    "episode_return": float,
+    "greedy_episode_return": float,
     "commit": str,
     "fingerprint": str,
     "versions": str,

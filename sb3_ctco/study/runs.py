@@ -2,22 +2,23 @@
 
 import contextlib
 import csv
-import fcntl
+import errno
 import json
 import os
 import platform
-import re
 import subprocess
+import sys
 import time
 import traceback
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from importlib import metadata
 from pathlib import Path
-from typing import Any, Literal
+from typing import IO, Any, Literal
 
 import numpy as np
 import torch as th
+from stable_baselines3.common.base_class import BaseAlgorithm
 
 import sb3_ctco
 from sb3_ctco.common.evaluation import DiscountedReturnCallback, EpisodeStatistics, evaluate_discounted_return
@@ -27,9 +28,7 @@ from sb3_ctco.study.grid import Run
 SETTINGS, VERSIONS, RECORD, ERROR, LOCK = "settings.json", "versions.json", "record.json", "error.txt", "lock"
 MONITOR, EVALUATION = "monitor.csv", "evaluation.csv"
 MONITOR_COLUMNS = ("task_seconds", "discounted_return", "decision_rate_hz", "wall_seconds")
-EVALUATION_COLUMNS = ("discounted_return", "decision_rate_hz")
-#: What is a folder's name on every operating system, and inside the folder that it is put in
-_NAME = re.compile(r"[A-Za-z0-9_][A-Za-z0-9_.+-]*")
+EVALUATION_COLUMNS = ("task_seconds", "discounted_return", "decision_rate_hz", "episode_return")
 _PACKAGES = ("sb3-ctco", "stable-baselines3", "torch", "numpy", "gymnasium", "mujoco", "dm-control")
 
 
@@ -50,28 +49,28 @@ class Outcome:
 def plan(runs: Sequence[Run], folder: Path) -> None:
     """Make the runs' folders, each with its settings.
 
-    :raises ValueError: if a folder has other settings, or a run's name is none of a folder
+    :raises ValueError: if a folder has other settings, or cannot be made
     """
     for run in runs:
-        file = folder_of(run, folder) / SETTINGS
-        if file.exists():
-            _refuse_other_settings(run, json.loads(file.read_text()), file)
-        else:
-            file.parent.mkdir(parents=True, exist_ok=True)
-            write_whole(file, json.dumps(run.as_dict(), indent=1) + "\n")
+        file = folder / run.name / SETTINGS
+        try:
+            if file.exists():
+                _refuse_other_settings(run, _read_settings(file), file)
+            else:
+                file.parent.mkdir(parents=True, exist_ok=True)
+                write_whole(file, json.dumps(run.as_dict(), indent=1) + "\n")
+        except OSError as error:
+            raise ValueError(
+                f"{folder} cannot be the study's folder: {error}. Name another --folder, one that can be written to"
+            ) from error
 
 
-def folder_of(run: Run, folder: str | Path) -> Path:
-    """A run's folder, which is always directly in the study's.
-
-    :raises ValueError: if the run's name, of which parts stand in preset files, is none of a folder
-    """
-    if not _NAME.fullmatch(run.name):
-        raise ValueError(
-            f"setting {run.setting!r} of {run.algorithm} would make the folder {run.name!r}: a setting's name must consist of "
-            "letters of the Latin alphabet, digits and the signs _ . + -"
-        )
-    return Path(folder) / run.name
+def _read_settings(file: Path) -> dict[str, Any]:
+    try:
+        settings: dict[str, Any] = json.loads(file.read_text())
+    except ValueError as error:
+        raise ValueError(f"{file} is damaged ({error}): delete {file.parent} to run it again") from error
+    return settings
 
 
 def _refuse_other_settings(run: Run, found: dict[str, Any], file: Path) -> None:
@@ -96,7 +95,7 @@ def perform(run: Run, folder: str | Path) -> Outcome:
     :param run: the run, planned in the folder
     :param folder: the study's
     """
-    path = folder_of(run, folder)
+    path = Path(folder) / run.name
     with lock(path) as locked:
         if not locked:
             return Outcome(run.name, "busy")
@@ -113,7 +112,7 @@ def perform(run: Run, folder: str | Path) -> Outcome:
 def record_failure(run: Run, folder: str | Path, error: Exception) -> Outcome:
     """Write an error and its traceback into a run's folder, if the disk takes them."""
     with contextlib.suppress(OSError):
-        write_whole(folder_of(run, folder) / ERROR, "".join(traceback.format_exception(error)))
+        write_whole(Path(folder) / run.name / ERROR, "".join(traceback.format_exception(error)))
     return Outcome(run.name, "failed", f"{type(error).__name__}: {error}")
 
 
@@ -129,8 +128,10 @@ def lock(path: Path, patience: float = 0.5) -> Iterator[bool]:
         end = time.monotonic() + patience
         while True:
             try:
-                fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-            except BlockingIOError:
+                _flock(file)
+            except OSError as error:
+                if error.errno not in (errno.EAGAIN, errno.EACCES, errno.EDEADLOCK):
+                    raise
                 if time.monotonic() >= end:
                     yield False
                     return
@@ -138,6 +139,19 @@ def lock(path: Path, patience: float = 0.5) -> Iterator[bool]:
             else:
                 yield True
                 return
+
+
+def _flock(file: IO[str]) -> None:
+    """Lock a file as a whole, or raise an ``OSError`` if another process has."""
+    if sys.platform == "win32":
+        import msvcrt  # noqa: PLC0415
+
+        file.seek(0)
+        msvcrt.locking(file.fileno(), msvcrt.LK_NBLCK, 1)
+    else:
+        import fcntl  # noqa: PLC0415
+
+        fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
 
 
 def is_running(path: Path) -> bool:
@@ -149,11 +163,14 @@ def is_running(path: Path) -> bool:
 
 
 class _Monitor(DiscountedReturnCallback):
-    """Writes each training episode to a CSV file as it ends."""
+    """Writes each training episode to a CSV file as it ends, and evaluates in the last tenth of task time."""
 
     def __init__(self, run: Run, file: Path):
         super().__init__(discount_rate(run))
         self.run, self.file = run, file
+        #: Greedy episodes, and the task time in s at which they were played
+        self.greedy: list[tuple[float, EpisodeStatistics]] = []
+        self._evaluations_left = run.evaluations
 
     def _on_training_start(self) -> None:
         super()._on_training_start()
@@ -168,7 +185,21 @@ class _Monitor(DiscountedReturnCallback):
             row = (timestep * self.run.dt, episode.discounted_return, episode.decision_rate_hz, wall_seconds)
             with self.file.open("a", newline="") as file:
                 csv.writer(file).writerow([_short(value) for value in row])
+        seconds = self.num_timesteps * self.run.dt
+        # The last evaluation is that of the model which is saved.
+        if self._evaluations_left > 1 and seconds >= self.run.task_seconds * (
+            1.0 - 0.1 * (self._evaluations_left - 1) / self.run.evaluations
+        ):
+            self.evaluate(self.model)
         return proceed
+
+    def evaluate(self, model: BaseAlgorithm) -> None:
+        """Play greedy episodes."""
+        self._evaluations_left -= 1
+        env = make_eval_env(self.run, model)
+        episodes = evaluate_discounted_return(model, env, self.run.eval_episodes, discount_rate=discount_rate(self.run))
+        env.close()
+        self.greedy += [(self.num_timesteps * self.run.dt, episode) for episode in episodes]
 
     def last_tenth(self) -> list[EpisodeStatistics]:
         """The episodes that ended in the last tenth of task time."""
@@ -187,12 +218,16 @@ def _train(run: Run, path: Path) -> None:
     wall_seconds = time.monotonic() - start
     model.save(path / "model.zip")
 
-    eval_env = make_eval_env(run, model)
-    greedy = evaluate_discounted_return(model, eval_env, run.eval_episodes, discount_rate=discount_rate(run))
-    _write_csv(path / EVALUATION, EVALUATION_COLUMNS, [(e.discounted_return, e.decision_rate_hz) for e in greedy])
-    for env in (model.get_env(), eval_env):
-        assert env is not None
-        env.close()
+    monitor.evaluate(model)
+    greedy = [episode for _, episode in monitor.greedy]
+    _write_csv(
+        path / EVALUATION,
+        EVALUATION_COLUMNS,
+        [(seconds, e.discounted_return, e.decision_rate_hz, e.episode_return) for seconds, e in monitor.greedy],
+    )
+    env = model.get_env()
+    assert env is not None
+    env.close()
     training = monitor.last_tenth()
     record = {
         "task": run.task,
@@ -208,6 +243,8 @@ def _train(run: Run, path: Path) -> None:
         "preset": run.preset,
         "setting": run.setting,
         "greedy_decision_rate_hz": _short(np.mean([e.decision_rate_hz for e in greedy])),
+        "episode_return": _short(np.mean([e.episode_return for e in training])),
+        "greedy_episode_return": _short(np.mean([e.episode_return for e in greedy])),
         "commit": commit,
         "fingerprint": run.fingerprint,
         "versions": " ".join(f"{name}={version}" for name, version in versions.items()),

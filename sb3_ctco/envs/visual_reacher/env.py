@@ -11,7 +11,7 @@ from gymnasium import spaces
 try:
     import mujoco
 except ImportError as error:  # pragma: no cover
-    raise ImportError("this environment needs mujoco: pip install 'sb3-ctco[dm-control]'") from error
+    raise ImportError("this environment needs mujoco: in a clone of sb3-ctco, run pip install '.[dm-control]'") from error
 
 from sb3_ctco.envs.visual_reacher.model import BAG_HALF_SIZE, JOINT_LIMITS, scene_xml
 from sb3_ctco.envs.visual_reacher.rendering import OffscreenCamera

@@ -1,12 +1,13 @@
 """CTCO's update with gradients worked out by hand, for networks of plain layers.
 
 In an update of small networks autograd and optimizers spend more time on their own bookkeeping than on numbers. CTCO's
-losses are a few lines, and so are their gradients: :class:`HandGradients` does, to rounding, what
+losses are a few lines, and so are their gradients: :class:`FastUpdate` does, to rounding, what
 :meth:`~sb3_ctco.common.soft_actor_critic.SoftOptionActorCritic._update` does with autograd, with the same random numbers.
 """
 
 from __future__ import annotations
 
+import inspect
 import math
 from collections.abc import Iterable, Sequence
 from typing import TYPE_CHECKING, Any
@@ -17,8 +18,8 @@ from stable_baselines3.common.type_aliases import ReplayBufferSamples
 from torch import nn
 from torch.nn import functional as F
 
+from sb3_ctco.common.losses import critic_loss
 from sb3_ctco.common.policies import LOG_STD_MAX, LOG_STD_MIN, EnsembleLinear, affine
-from sb3_ctco.common.soft_actor_critic import critic_loss
 from sb3_ctco.ctco.policies import OptionActor, OptionCritic
 
 if TYPE_CHECKING:
@@ -30,12 +31,12 @@ aten = th.ops.aten
 Part = tuple[nn.Module, slice]
 
 
-class HandGradients:
+class FastUpdate:
     """Updates of a :class:`~sb3_ctco.ctco.ctco.CTCO` without autograd, on copies of its networks' parameters.
 
     :meth:`load` takes the copies and :meth:`store` writes them back: around every training.
 
-    :param model: whose networks it updates; :meth:`possible_for` it must be true
+    :param model: whose networks it updates; :meth:`refusal` must have nothing to say against it
     """
 
     def __init__(self, model: CTCO):
@@ -45,21 +46,32 @@ class HandGradients:
         self._memory = _memory(model.policy.parameters())
 
     @staticmethod
-    def possible_for(model: CTCO) -> bool:
-        """Whether ``model`` has networks of linear layers and rectifiers, and fused Adam that has stepped.
+    def refusal(model: CTCO) -> str | None:
+        """Why ``model`` must be updated with autograd: what gradients were not worked out for; None if nothing is."""
+        from sb3_ctco.ctco.ctco import CTCO  # noqa: PLC0415
 
-        That its losses are CTCO's own is for the caller to know.
-        """
         actors, critics = (model.actor, model.actor_target), (model.critic, model.critic_target)
+        networks = actors + critics
         optimizers = [model.actor.optimizer, model.critic.optimizer, *filter(None, [model.ent_coef_optimizer])]
-        return (
-            model.entropy_reference != "duration"  # whose weight is another way to the gradient of d
-            and all(type(actor) is OptionActor and _is_plain(actor.latent_pi, nn.Linear) for actor in actors)
-            and all(type(critic) is OptionCritic and _is_plain(critic.q_networks, EnsembleLinear) for critic in critics)
-            and all(type(network.features_extractor) is FlattenExtractor for network in actors + critics)
-            and all(p.requires_grad for network in (model.actor, model.critic) for p in network.parameters())
-            and all(_is_fused_adam(optimizer) for optimizer in optimizers)
+        overridden = [name for name in vars(model) if inspect.isfunction(getattr(type(model), name, None))]
+        plain_networks = all(type(actor) is OptionActor and _is_plain(actor.latent_pi, nn.Linear) for actor in actors) and all(
+            type(critic) is OptionCritic and _is_plain(critic.q_networks, EnsembleLinear) for critic in critics
         )
+        reasons = {
+            f"{type(model).__name__} is a subclass of CTCO, which may have losses of its own": type(model) is not CTCO,
+            f"the model has methods of its own: {overridden}": overridden,
+            "the networks are others than linear layers with rectifiers between them": not plain_networks,
+            "the features extractor has something to learn": any(
+                type(network.features_extractor) is not FlattenExtractor for network in networks
+            ),
+            "parameters are frozen": not all(p.requires_grad for one in (model.actor, model.critic) for p in one.parameters()),
+            "a network or a parameter has hooks": any(map(_has_hooks, networks)),
+            # Optimizers get their state with their first step.
+            "an optimizer is another than fused Adam, has hooks, or has made no step so far": not all(
+                map(_is_plain_adam, optimizers)
+            ),
+        }
+        return next((reason for reason, applies in reasons.items() if applies), None)
 
     def is_valid(self) -> bool:
         """Whether the networks' parameters are still where they were, as they are not after ``policy.to(device)``."""
@@ -103,21 +115,23 @@ class HandGradients:
             self._ent_coef_gradient.copy_(gradient)
             self._ent_coef_adam.step()
 
-        inputs = th.cat((features, th.stack((data.actions, options[1]))), dim=2)
+        inputs = th.cat((features, model._as_critics_see(th.stack((data.actions, options[1])))), dim=2)
         # Of the critics, and of their targets.
         q_values, next_q_values = self._critics.forward(
             inputs[:, None].expand(-1, n_critics, -1, -1).flatten(end_dim=1)
         ).split(n_critics)
-        targets = model._targets(data, next_q_values, model.entropy_costs(options[1], log_prob[1]))
+        targets = model._targets(data, next_q_values, model.entropy_costs(log_prob[1]))
         self._critics.backward((q_values - targets) / batch_size)
         self._critic_adam.step()
         q_loss = critic_loss(q_values, targets)
 
-        inputs = th.cat((features[0], options[0]), dim=1)
+        inputs = th.cat((features[0], model._as_critics_see(options[0])), dim=1)
         q_values = self._critics.forward(inputs.expand(n_critics, -1, -1))
         q_min = q_values.amin(dim=0)
-        pi_loss = (model.entropy_costs(options[0], log_prob[0]) - q_min).mean()
+        pi_loss = (model.entropy_costs(log_prob[0]) - q_min).mean()
         option_gradient = self._critics.input_gradient((q_values == q_min) / -batch_size, first=features.shape[2])
+        if model.canonical_options is not None:
+            option_gradient = model.canonical_options.gradient(option_gradient, options[0])
         self._actors.backward(option_gradient, model.ent_coefs / batch_size)
         self._actor_adam.step()
 
@@ -341,9 +355,17 @@ def _is_plain(network: nn.Sequential, linear: type[nn.Module]) -> bool:
     return len(network) > 0 and all(type(module) is (nn.ReLU if i % 2 else linear) for i, module in enumerate(network))
 
 
-def _is_fused_adam(optimizer: th.optim.Optimizer) -> bool:
+def _has_hooks(network: nn.Module) -> bool:
+    return any(
+        module._forward_hooks or module._forward_pre_hooks or module._backward_hooks or module._backward_pre_hooks
+        for module in network.modules()
+    ) or any(p._backward_hooks or p._post_accumulate_grad_hooks for p in network.parameters())
+
+
+def _is_plain_adam(optimizer: th.optim.Optimizer) -> bool:
     refused = ("amsgrad", "maximize", "capturable", "differentiable", "decoupled_weight_decay")
-    return type(optimizer) is th.optim.Adam and all(
+    hooks = optimizer._optimizer_step_pre_hooks or optimizer._optimizer_step_post_hooks or "step" in vars(optimizer)
+    return (type(optimizer) is th.optim.Adam and not hooks) and all(
         group["fused"] and not any(group.get(name) for name in refused) and all(p in optimizer.state for p in group["params"])
         for group in optimizer.param_groups
     )

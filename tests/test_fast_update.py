@@ -1,6 +1,7 @@
 """CTCO's update by hand-worked gradients, against autograd's."""
 
 import copy
+import re
 
 import gymnasium as gym
 import numpy as np
@@ -8,7 +9,7 @@ import pytest
 import torch as th
 
 from sb3_ctco import CTCO
-from sb3_ctco.ctco.gradients import HandGradients, PlainNetworks, _layers
+from sb3_ctco.ctco.fast_update import FastUpdate, PlainNetworks, _layers
 from sb3_ctco.ctco.policies import EnsembleLinear
 
 SMALL = {
@@ -27,7 +28,7 @@ def make(**kwargs):
 def plain(model):
     """The same model, updated with autograd."""
     other = copy.deepcopy(model)
-    other._prepare_hand_gradients = lambda: setattr(other, "_hand_gradients", None)
+    other.fast_updates = False
     return other
 
 
@@ -42,11 +43,14 @@ def plain(model):
         {"policy_kwargs": {"n_critics": 3, "net_arch": {"pi": [8, 8, 8], "qf": []}}},
         {"policy_kwargs": {"net_arch": [8], "optimizer_kwargs": {"betas": (0.8, 0.9), "eps": 1e-5, "weight_decay": 0.1}}},
         {"d_min": 0.1, "d_max": 0.1},
+        {"n_rbf": 3, "d_max": 0.15},
+        {"n_rbf": 3, "d_max": 0.15, "canonical_weights": False},
+        {"n_rbf": 3, "d_max": 0.3, "duration_scale": "log", "trajectory": "bezier"},
     ],
 )
 def test_an_update_is_that_of_autograd(kwargs):
     model = make(learning_rate=1e-2, **kwargs).learn(80)
-    assert HandGradients.possible_for(model)
+    assert FastUpdate.refusal(model) is None
     with th.no_grad():
         model.actor.omega_head.bias[2] = 3.0  # a standard deviation beyond its bound, through which no gradient goes
         for target in model._target_parameters:
@@ -58,7 +62,8 @@ def test_an_update_is_that_of_autograd(kwargs):
             th.manual_seed(1)
             np.random.seed(1)
             one.train(n_updates, 16)
-        assert model._hand_gradients is not None and other._hand_gradients is None
+        assert model.fast_updates_refusal is None
+        assert other.fast_updates_refusal == "fast_updates=False"
         expected = other.policy.state_dict()
         for name, value in model.policy.state_dict().items():
             th.testing.assert_close(value, expected[name], rtol=1e-5 * n_updates, atol=1e-6 * n_updates, msg=name)
@@ -100,22 +105,60 @@ class OtherTargets(CTCO):
         """Targets that stay where they are."""
 
 
+class OtherUpdate(CTCO):
+    """Whose update learns nothing but to be noticed."""
+
+    def _update(self, data):
+        with th.no_grad():
+            self.actor.omega_head.bias.add_(1.0)
+        return th.zeros(3)
+
+
+def hooked(model, add):
+    add(model)
+    return model
+
+
 @pytest.mark.parametrize(
-    "make_model",
+    ("make_model", "reason"),
     [
-        lambda: make(policy_kwargs={"net_arch": [8], "activation_fn": th.nn.Tanh}),
-        lambda: make(policy_kwargs={"net_arch": []}),
-        lambda: make(policy_kwargs={"net_arch": [8], "optimizer_kwargs": {"amsgrad": True}}),
-        lambda: make(policy_kwargs={"net_arch": [8], "optimizer_class": th.optim.SGD}),
-        lambda: OtherLoss("MlpPolicy", "Pendulum-v1", **SMALL),
-        lambda: OtherTargets("MlpPolicy", "Pendulum-v1", **SMALL),
+        (lambda: make(policy_kwargs={"net_arch": [8], "activation_fn": th.nn.Tanh}), "linear layers"),
+        (lambda: make(policy_kwargs={"net_arch": []}), "linear layers"),
+        (lambda: make(policy_kwargs={"net_arch": [8], "optimizer_kwargs": {"amsgrad": True}}), "optimizer"),
+        (lambda: make(policy_kwargs={"net_arch": [8], "optimizer_class": th.optim.SGD}), "optimizer"),
+        (lambda: OtherLoss("MlpPolicy", "Pendulum-v1", **SMALL), "OtherLoss is a subclass"),
+        (lambda: OtherTargets("MlpPolicy", "Pendulum-v1", **SMALL), "OtherTargets is a subclass"),
+        (lambda: OtherUpdate("MlpPolicy", "Pendulum-v1", **SMALL), "OtherUpdate is a subclass"),
+        (lambda: make(fast_updates=False), "fast_updates=False"),
+        (lambda: hooked(make(), lambda m: setattr(m, "_actor_loss", m._actor_loss)), "methods of its own: .'_actor_loss'"),
+        (lambda: hooked(make(), lambda m: m.actor.latent_pi[0].register_forward_hook(lambda *_: None)), "hooks"),
+        (lambda: hooked(make(), lambda m: m.critic.q_networks[0].weight.register_hook(lambda g: g)), "hooks"),
+        (lambda: hooked(make(), lambda m: m.actor.optimizer.register_step_post_hook(lambda *_: None)), "hooks"),
     ],
 )
-def test_what_it_does_not_know_is_left_to_autograd(make_model):
+def test_what_it_does_not_know_is_left_to_autograd(make_model, reason):
     model = make_model().learn(80)
     model.train(1, 16)
     assert model._n_updates > 0
-    assert model._hand_gradients is None
+    assert re.search(reason, model.fast_updates_refusal)
+    assert model._fast_update is None
+
+
+def test_a_subclass_with_an_update_of_its_own_keeps_what_it_learned():
+    model = OtherUpdate("MlpPolicy", "Pendulum-v1", **SMALL).learn(80)
+    before = model.actor.omega_head.bias.detach().clone()
+    model.train(3, 16)
+    th.testing.assert_close(model.actor.omega_head.bias.detach(), before + 3.0)
+
+
+def test_a_step_size_holds_from_the_training_on_for_which_it_is_given():
+    model = make().learn(80)
+    model.lr_schedule = lambda _: 0.0
+    before = copy.deepcopy(list(model.actor.parameters()))
+    model.train(3, 16)
+    assert model.fast_updates_refusal is None
+    for parameter, value in zip(model.actor.parameters(), before, strict=True):
+        th.testing.assert_close(parameter, value, rtol=0, atol=0)
 
 
 def test_frozen_parameters_stay():
@@ -128,7 +171,7 @@ def test_frozen_parameters_stay():
 
 def test_after_loading_and_moving_it_works_on_the_new_parameters(tmp_path):
     model = make().learn(80)
-    assert model._hand_gradients is not None
+    assert model.fast_updates_refusal is None
     model.save(tmp_path / "model")
     model.save_replay_buffer(tmp_path / "buffer")
     loaded = CTCO.load(tmp_path / "model", env=gym.make("Pendulum-v1"), device="cpu")
@@ -142,6 +185,6 @@ def test_after_loading_and_moving_it_works_on_the_new_parameters(tmp_path):
         th.manual_seed(1)
         np.random.seed(1)
         one.train(3, 16)
-    assert model._hand_gradients is not None
+    assert model.fast_updates_refusal is None
     for name, value in model.policy.state_dict().items():
         th.testing.assert_close(value, other.policy.state_dict()[name], rtol=1e-5, atol=1e-6, msg=name)

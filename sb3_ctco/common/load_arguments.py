@@ -1,0 +1,52 @@
+"""What may be changed of a saved model while it is loaded."""
+
+import inspect
+import io
+import math
+import pathlib
+from collections.abc import Collection
+from typing import Any
+
+from stable_baselines3.common.base_class import BaseAlgorithm
+from stable_baselines3.common.save_util import load_from_zip_file
+
+
+def check_load_arguments(
+    algorithm: type[BaseAlgorithm],
+    path: str | pathlib.Path | io.BufferedIOBase,
+    arguments: dict[str, Any],
+    kept: Collection[str],
+) -> dict[str, Any]:
+    """Arguments of ``load`` that take effect: Stable-Baselines3 makes attributes of all, whether anything reads them or not.
+
+    :param algorithm: the class that is loaded
+    :param path: of the file
+    :param arguments: what was passed to ``load`` beside its own parameters
+    :param kept: names of those that only the file's value is right for, because the networks were trained with it
+    :return: the arguments by the names of their attributes
+    :raises TypeError: for an argument that the class's constructor does not have
+    :raises ValueError: for one of ``kept`` that differs from the file's
+    """
+    known = inspect.signature(algorithm.__init__).parameters.keys() - {"self", "policy", "env", "device", "_init_setup_model"}
+    unknown = sorted(arguments.keys() - known)
+    if unknown:
+        raise TypeError(f"{algorithm.__name__} has no arguments {unknown} to change while loading; it has {sorted(known)}")
+    fixed = sorted(arguments.keys() & set(kept))
+    if fixed:
+        data, _, _ = load_from_zip_file(path, device="cpu")
+        assert data is not None
+        differing = {name: arguments[name] for name in fixed if not _equal(arguments[name], data.get(name))}
+        if differing:
+            of_file = {name: data.get(name) for name in differing}
+            raise ValueError(
+                f"{differing} cannot be changed while loading: the file's networks were trained with {of_file}. Leave them "
+                f"out, or make a new model; these can be changed: {sorted(known - set(kept))}"
+            )
+    return {"_stats_window_size" if name == "stats_window_size" else name: value for name, value in arguments.items()}
+
+
+def _equal(one: Any, other: Any) -> bool:
+    # FiGAR-SAC's d_max is a number of steps times dt by the time it is saved.
+    if isinstance(one, int | float) and isinstance(other, int | float):
+        return math.isclose(one, other, rel_tol=1e-9)
+    return bool(one == other)

@@ -1,0 +1,64 @@
+"""The option model and the arithmetic of its semi-Markov decision process.
+
+Pure functions of numpy arrays and frozen objects; equations are those of Karimi et al. 2023, "Dynamic Decision Frequency with
+Continuous Options" (https://arxiv.org/abs/2212.04407). Words and units:
+
+============== ============================================ ========================
+paper          code                                         unit or shape
+============== ============================================ ========================
+Δt             ``dt``                                       s
+ω              ``omega``                                    [action_dim, n_weights]
+d              ``duration``                                 s
+φ(t/d)         ``basis``                                    [n_steps, n_weights]
+τ              ``discount_rate``                            1/s
+γ(d) = e^(−τd) ``discount``                                 –
+R              ``integrated_reward``                        reward rate × s
+============== ============================================ ========================
+"""
+
+from sb3_ctco.options.semi_mdp import (
+    DEFAULT_DISCOUNT_RATE,
+    REWARD_UNITS,
+    FloatArray,
+    OptionInfo,
+    RewardUnit,
+    discount,
+    discount_rate_from_gamma,
+    discounts_of_steps,
+    integrated_reward,
+    step_weight,
+    steps_in,
+)
+from sb3_ctco.options.space import DURATION_SCALES, ActionBox, DurationScale, OptionSpace
+from sb3_ctco.options.sub_options import Stacked, SubOptions, draw_stretches, rows_of, shortest_steps, stack, sub_options
+from sb3_ctco.options.trajectory import TRAJECTORIES, BezierCurve, RadialBasis, Trajectory, basis_of_steps
+
+__all__ = [
+    "DEFAULT_DISCOUNT_RATE",
+    "DURATION_SCALES",
+    "REWARD_UNITS",
+    "TRAJECTORIES",
+    "ActionBox",
+    "BezierCurve",
+    "DurationScale",
+    "FloatArray",
+    "OptionInfo",
+    "OptionSpace",
+    "RadialBasis",
+    "RewardUnit",
+    "Stacked",
+    "SubOptions",
+    "Trajectory",
+    "basis_of_steps",
+    "discount",
+    "discount_rate_from_gamma",
+    "discounts_of_steps",
+    "draw_stretches",
+    "integrated_reward",
+    "rows_of",
+    "shortest_steps",
+    "stack",
+    "step_weight",
+    "steps_in",
+    "sub_options",
+]

@@ -1,0 +1,167 @@
+"""What an option vector means: shared by a policy, its environment, its buffer and its controller."""
+
+import math
+from dataclasses import dataclass, fields
+from typing import Any, Literal
+
+import numpy as np
+import numpy.typing as npt
+
+from sb3_ctco.options.semi_mdp import FloatArray, steps_in
+from sb3_ctco.options.trajectory import TRAJECTORIES, Trajectory
+
+DurationScale = Literal["log", "linear"]
+DURATION_SCALES: tuple[DurationScale, ...] = ("log", "linear")
+
+
+@dataclass(frozen=True)
+class OptionSpace:
+    """What an option vector means. A policy and the environment it acts in must share it.
+
+    An option vector is ``[ω flattened from [action_dim, n_weights], duration]``, every entry in [−1, 1].
+
+    :param trajectory: how ω becomes actions
+    :param d_max: longest duration, in s
+    :param d_min: shortest duration, in s
+    :param dt: the interaction period of the environment, in s
+    :param discount_rate: τ, in 1/s
+    :param duration_scale: how [−1, 1] maps to [d_min, d_max]: ``"linear"`` is the paper's, with ``"log"`` equal steps
+        multiply the duration, so that short ones are as easy to tell apart as long ones whatever ``d_max`` is
+    :raises ValueError: if a setting is out of its range
+    """
+
+    trajectory: Trajectory
+    d_max: float
+    d_min: float
+    dt: float
+    discount_rate: float
+    duration_scale: DurationScale = "linear"
+
+    def __post_init__(self) -> None:
+        for name in ("dt", "d_max", "d_min"):
+            value = getattr(self, name)
+            if not (value > 0 and math.isfinite(value)):
+                raise ValueError(f"{name} must be a positive number of seconds, not {value}")
+        if self.d_min > self.d_max:
+            raise ValueError(
+                f"d_min={self.d_min} s is longer than d_max={self.d_max} s: "
+                "raise d_max, or pass a d_min (by default one step, dt) that is at most d_max"
+            )
+        if not (self.discount_rate >= 0 and math.isfinite(self.discount_rate)):
+            raise ValueError(f"discount_rate must be a finite number of 1/s that is at least 0, not {self.discount_rate}")
+        if self.duration_scale not in DURATION_SCALES:
+            raise ValueError(f"duration_scale must be one of {DURATION_SCALES}, not {self.duration_scale!r}")
+
+    @classmethod
+    def make(
+        cls,
+        n_rbf: int,
+        d_max: float,
+        d_min: float,
+        dt: float,
+        discount_rate: float,
+        trajectory: str | type[Trajectory] = "rbf",
+        duration_scale: DurationScale = "linear",
+    ) -> "OptionSpace":
+        """An option space from the arguments that wrappers and algorithms take.
+
+        :param n_rbf: number of weights an action dimension
+        :param trajectory: a name in :data:`~sb3_ctco.options.trajectory.TRAJECTORIES`, or a class
+        """
+        if isinstance(trajectory, str):
+            if trajectory not in TRAJECTORIES:
+                raise ValueError(f"trajectory must be one of {list(TRAJECTORIES)} or a Trajectory class, not {trajectory!r}")
+            trajectory = TRAJECTORIES[trajectory]
+        return cls(trajectory(n_rbf), d_max, d_min, dt, discount_rate, duration_scale)
+
+    @property
+    def arguments(self) -> dict[str, Any]:
+        """What :meth:`make`, or ``OptionExecutionWrapper``, makes the same option space from."""
+        names = {kind: name for name, kind in TRAJECTORIES.items()}
+        kind = type(self.trajectory)
+        return {
+            "n_rbf": self.trajectory.n_weights,
+            "trajectory": names.get(kind, kind),
+            **{field.name: getattr(self, field.name) for field in fields(self) if field.name != "trajectory"},
+        }
+
+    def differences(self, other: "OptionSpace") -> dict[str, tuple[Any, Any]]:
+        """Arguments that differ by more than rounding, each with its value here and in the other."""
+        pairs = {name: (value, other.arguments[name]) for name, value in self.arguments.items()}
+        return {
+            name: (here, there)
+            for name, (here, there) in pairs.items()
+            if not (here == there or (isinstance(here, float) and math.isclose(here, there, rel_tol=1e-6)))
+        }
+
+    def duration(self, option: FloatArray) -> float:
+        """The duration d that an option vector asks for, in s: its last entry, mapped from [−1, 1] to [d_min, d_max]."""
+        return self.seconds(float(option[-1]))
+
+    def seconds(self, normalised: Any) -> Any:
+        """The duration in s that a number in [−1, 1] stands for, or an array or tensor of such."""
+        fraction = 0.5 * (normalised + 1.0)
+        if self.duration_scale == "log":
+            return self.d_min * (self.d_max / self.d_min) ** fraction
+        return self.d_min + fraction * (self.d_max - self.d_min)
+
+    def encode(self, omega: FloatArray, n_steps: npt.NDArray[np.integer]) -> FloatArray:
+        """The option vectors that :meth:`decode` turns into these; d is encoded as 0 if d_min = d_max.
+
+        :param omega: weights, shape ``[n, action_dim, n_weights]``
+        :param n_steps: numbers of primitive steps, shape ``[n]``
+        :return: shape ``[n, action_dim · n_weights + 1]``, float32
+        """
+        options = np.zeros((len(omega), omega.shape[1] * omega.shape[2] + 1), dtype=np.float32)
+        options[:, :-1] = omega.reshape(len(omega), options.shape[1] - 1)
+        if self.d_max > self.d_min:
+            durations = n_steps * self.dt
+            if self.duration_scale == "log":
+                fraction = np.log(durations / self.d_min) / math.log(self.d_max / self.d_min)
+            else:
+                fraction = (durations - self.d_min) / (self.d_max - self.d_min)
+            options[:, -1] = (2.0 * fraction - 1.0).clip(-1.0, 1.0)
+        return options
+
+    def decode(self, option: FloatArray) -> tuple[FloatArray, int]:
+        """Split an option vector.
+
+        :param option: shape ``[action_dim · n_weights + 1]``, entries in [−1, 1]
+        :return: ω, shape ``[action_dim, n_weights]``, and the number of primitive steps
+        """
+        return option[:-1].reshape(-1, self.trajectory.n_weights), steps_in(self.duration(option), self.dt)
+
+    def plan(self, option: FloatArray) -> FloatArray:
+        """All actions of an option, normalised: shape ``[n_steps, action_dim]``."""
+        omega, n_steps = self.decode(option)
+        return self.trajectory.plan(omega, n_steps)
+
+
+class ActionBox:
+    """The bounds of primitive actions, to which normalised ones are scaled.
+
+    :param low: lower bounds, shape ``action_shape``, of which action_dim is the product
+    :param high: upper bounds, likewise
+    """
+
+    def __init__(self, low: npt.NDArray[Any], high: npt.NDArray[Any]):
+        self.low, self.high = low, high
+        self._bottom = low.astype(np.float64).ravel()
+        self._half_width = 0.5 * (high.astype(np.float64).ravel() - self._bottom)
+
+    def actions(self, trajectory: FloatArray) -> npt.NDArray[Any]:
+        """Normalised actions in the units of the box.
+
+        :param trajectory: actions in [−1, 1], shape ``[n_steps, action_dim]``
+        :return: shape ``[n_steps, *action_shape]``, in the precision of ``low``
+        """
+        return self.cast(self.scale(trajectory))
+
+    def scale(self, trajectory: FloatArray) -> FloatArray:
+        """Normalised actions in the units of the box, in double precision: shape ``[n_steps, action_dim]``, as given."""
+        return (trajectory + 1.0) * self._half_width + self._bottom
+
+    def cast(self, actions: FloatArray) -> npt.NDArray[Any]:
+        """Actions in the units of the box, in its shape and precision: ``[n_steps, *action_shape]``."""
+        # The cast may round past a bound.
+        return actions.astype(self.low.dtype).reshape(-1, *self.low.shape).clip(self.low, self.high)

@@ -1,0 +1,42 @@
+"""Models and replay buffers that version 0.1.0 saved, in tests/data: they act as they did, and learn on."""
+
+from pathlib import Path
+
+import gymnasium as gym
+import numpy as np
+import pytest
+
+from sb3_ctco import CTCO, FiGARSAC
+from sb3_ctco.option_array import plain
+
+DATA = Path(__file__).parent / "data"
+OBSERVATIONS = np.array([[1.0, 0.0, 0.0], [0.0, 1.0, 1.0]], dtype=np.float32)
+#: What 0.1.0 printed of ``predict(OBSERVATIONS, deterministic=True)``
+OPTIONS = {
+    CTCO: [[0.23800993, 0.16001892, 0.10798693], [0.22889364, 0.07423103, 0.08157694]],
+    FiGARSAC: [[-0.163306, -0.78947365], [-0.19485867, -0.78947365]],
+}
+
+
+@pytest.mark.parametrize("algorithm", [CTCO, FiGARSAC])
+def test_a_model_of_0_1_0_acts_as_it_did_and_learns_on(algorithm):
+    name = {CTCO: "ctco", FiGARSAC: "figar_sac"}[algorithm]
+    model = algorithm.load(DATA / f"{name}-0.1.0.zip", env=gym.make("Pendulum-v1"), device="cpu")
+    options, _ = model.predict(OBSERVATIONS, deterministic=True)
+    np.testing.assert_allclose(plain(options), OPTIONS[algorithm], atol=1e-5)
+    # Its durations were linear, and R was in reward × s.
+    assert model.option_space.duration_scale == "linear"
+    assert model.replay_buffer.reward_scale == 1.0
+    if algorithm is CTCO:
+        assert model.canonical_options is None  # Its critics saw weights as they were.
+    before = model._n_updates
+    assert model.learn(60, reset_num_timesteps=False)._n_updates > before
+
+
+def test_a_replay_buffer_of_0_1_0_is_learned_from():
+    model = CTCO.load(DATA / "ctco-0.1.0.zip", env=gym.make("Pendulum-v1"), device="cpu")
+    model.load_replay_buffer(DATA / "ctco-0.1.0-buffer.pkl")
+    assert model.replay_buffer.size() == 154
+    model.learn(60, reset_num_timesteps=False)
+    samples = model.replay_buffer.sample(8)
+    assert samples.rewards.shape == samples.discounts.shape == (8, 1)
