@@ -176,6 +176,25 @@ def test_the_critics_see_what_is_played(random_walk_env):
     assert make(random_walk_env(), n_rbf=2, canonical_weights=False).canonical_options is None
 
 
+def test_what_was_counted_goes_on_after_loading(tmp_path, random_walk_env):
+    model = make(random_walk_env(), target_decision_rate=5.0).learn(60)
+    counted = model._counted_decisions
+    assert counted[0] > 0
+    model.save(tmp_path / "model")
+    model.save_replay_buffer(tmp_path / "buffer")
+    loaded = CTCO.load(tmp_path / "model", env=random_walk_env())
+    loaded.load_replay_buffer(tmp_path / "buffer")
+    assert tuple(loaded._counted_decisions) == counted
+    before = loaded.log_high_freq_penalty.item()
+    loaded._update_high_freq_penalty()  # no decision since
+    assert loaded.log_high_freq_penalty.item() == before
+
+
+def test_the_temperature_has_sacs_name(random_walk_env):
+    model = make(random_walk_env(), ent_coef="auto_0.5").learn(30)
+    th.testing.assert_close(model.log_ent_coef, model.log_ent_coefs[:1].detach())
+
+
 def test_what_a_decision_costs_is_logged(random_walk_env):
     model = make(random_walk_env(), high_freq_penalty=0.25).learn(40)
     model.train(1, 8)

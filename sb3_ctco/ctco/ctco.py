@@ -110,7 +110,6 @@ class CTCO(SoftOptionActorCritic):
         **SoftOptionActorCritic._before_it_was_saved,
         "canonical_weights": False,
     }
-
     policy_aliases: ClassVar[dict[str, type[BasePolicy]]] = {
         "MlpPolicy": MlpPolicy,
         "CnnPolicy": CnnPolicy,
@@ -276,8 +275,8 @@ class CTCO(SoftOptionActorCritic):
             assert isinstance(self.high_freq_penalty, int | float)
             self.log_high_freq_penalty = th.tensor(math.log(self.high_freq_penalty), requires_grad=True)
             self.high_freq_penalty_optimizer = th.optim.Adam([self.log_high_freq_penalty], lr=self.lr_schedule(1))
-            #: What the replay buffer had counted at the last training: decisions, and their time in s.
-            self._counted_decisions = (0, 0.0)
+            #: What the replay buffer had counted at the last training: decisions, and their time in s; a file's goes on.
+            self._counted_decisions: tuple[int, float] = getattr(self, "_counted_decisions", (0, 0.0))
         self._last_next_values: tuple[th.Tensor, th.Tensor] | None = None
         assert self.d_min is not None
         # Read from the batch where it is "average"

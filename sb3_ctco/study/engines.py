@@ -43,8 +43,9 @@ def run_local(runs: Sequence[Run], folder: Path, workers: int) -> Iterator[Outco
                 at_work[connection] = process, waiting.popleft()
                 with contextlib.suppress(BrokenPipeError):  # it has died, as is found below
                     connection.send(at_work[connection][1])
-            for connection in wait(list(at_work)):
-                assert isinstance(connection, Connection)
+            for ready in wait(list(at_work)):
+                assert isinstance(ready, Connection)
+                connection = ready
                 process, run = at_work.pop(connection)
                 try:
                     outcome: Outcome = connection.recv()
