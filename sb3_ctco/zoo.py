@@ -33,13 +33,13 @@ except ImportError as error:  # pragma: no cover
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.vec_env import VecEnv
 
+from sb3_ctco import registry
 from sb3_ctco.common.option_algorithm import OptionOffPolicyAlgorithm
-from sb3_ctco.ctco import CTCO
-from sb3_ctco.dac_ppo import DACPPO
-from sb3_ctco.figar_sac import FiGARSAC
 
 #: The package's algorithms by their names in the Zoo.
-ALGORITHMS: dict[str, type[BaseAlgorithm]] = {"ctco": CTCO, "dac_ppo": DACPPO, "figar_sac": FiGARSAC}
+ALGORITHMS: dict[str, type[BaseAlgorithm]] = {
+    name: row.zoo_class for name, row in registry.ALGORITHMS.items() if row.zoo_class is not None
+}
 
 WRAPPER = "sb3_ctco.wrappers.OptionExecutionWrapper"
 
