@@ -35,6 +35,7 @@ from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_ctco import registry
 from sb3_ctco.common.option_algorithm import OptionOffPolicyAlgorithm
+from sb3_ctco.envs.quiet import mute_deprecated_attributes
 
 #: The package's algorithms by their names in the Zoo.
 ALGORITHMS: dict[str, type[BaseAlgorithm]] = {
@@ -175,6 +176,7 @@ def main(arguments: Sequence[str]) -> None:
     :param arguments: ``"train"``, ``"tune"`` or ``"enjoy"``, then RL Zoo's flags
     """
     command, *flags = arguments
+    mute_deprecated_attributes()
     argv, manager = sys.argv, rl_zoo3.train.ExperimentManager
     sys.argv = [f"sb3-ctco {command}", *with_defaults(command, flags)]
     rl_zoo3.train.ExperimentManager = OptionExperimentManager  # type: ignore[misc]

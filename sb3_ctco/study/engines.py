@@ -11,6 +11,7 @@ from multiprocessing.connection import Connection, wait
 from multiprocessing.process import BaseProcess
 from pathlib import Path
 
+from sb3_ctco.envs.quiet import mute_deprecated_attributes
 from sb3_ctco.study.grid import Run
 from sb3_ctco.study.runs import Outcome, perform, record_failure
 
@@ -93,6 +94,7 @@ def _start_worker(folder: Path) -> tuple[Connection, BaseProcess]:
 
 
 def _work(connection: Connection, folder: Path) -> None:
+    mute_deprecated_attributes()
     threading.Thread(target=_end_with_the_study, daemon=True).start()
     # Until the study closes its end, or somebody presses Ctrl-C, which reaches every process of the terminal.
     with contextlib.suppress(EOFError, KeyboardInterrupt):
