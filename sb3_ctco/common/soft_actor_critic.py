@@ -19,7 +19,7 @@ class SoftOptionActorCritic(OptionOffPolicyAlgorithm):
     """Soft actor-critic whose options have two parts: what to do, and for how long.
 
     Each part has a temperature of its own. Subclasses say how the policy is sampled, what the critics learn, and how
-    the actor is judged: ``_sample_policy``, ``_q_values``, ``_critic_targets``, ``_actor_loss`` and
+    the actor is judged: ``_sample_policy``, ``_q_values``, ``_critic_targets``, ``_critic_loss``, ``_actor_loss`` and
     ``_auto_target_entropies``.
 
     Parameters that :class:`~sb3_ctco.common.option_algorithm.OptionOffPolicyAlgorithm` has are documented there:
@@ -120,6 +120,10 @@ class SoftOptionActorCritic(OptionOffPolicyAlgorithm):
         """What the critics learn, ``[batch, 1]``; called without gradients."""
         raise NotImplementedError
 
+    def _critic_loss(self, q_values: th.Tensor, targets: th.Tensor) -> th.Tensor:
+        """The critics' loss, of what ``_q_values`` and ``_critic_targets`` returned."""
+        return critic_loss(q_values, targets)
+
     def _q_values(self, data: ReplayBufferSamples) -> th.Tensor:
         """The critics' values of the stored options, ``[n_critics, batch, 1]``."""
         return self.critic(data.observations, data.actions)
@@ -184,7 +188,7 @@ class SoftOptionActorCritic(OptionOffPolicyAlgorithm):
 
         with th.no_grad():
             targets = self._critic_targets(data)
-        q_loss = critic_loss(self._q_values(data), targets)
+        q_loss = self._critic_loss(self._q_values(data), targets)
         self.critic.optimizer.zero_grad()
         q_loss.backward()
         self.critic.optimizer.step()
