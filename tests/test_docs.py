@@ -62,6 +62,26 @@ def test_the_installation_page_has_every_extra():
     assert [name for name in names if f"| `{name}` |" not in page] == []
 
 
+def test_the_study_page_has_every_preset_and_its_own_one_loads(tmp_path):
+    pytest.importorskip("yaml")
+    from sb3_ctco.study.agents import constructor_arguments
+    from sb3_ctco.study.grid import load_preset, preset_names
+
+    page = (ROOT / "docs" / "study.md").read_text()
+    rows = dict(re.findall(r"^\| `(\w+)` \|(?:[^|]*\|){3} ([\d,and ]+) \|", page, re.MULTILINE))
+    assert set(rows) == set(preset_names())
+    for name, numbers in rows.items():
+        assert sum(int(number.replace(",", "")) for number in numbers.split(" and ")) == len(load_preset(name).runs)
+
+    (block,) = re.findall(r"```yaml\n(.*?)```", page, re.DOTALL)
+    (tmp_path / "mine.yml").write_text(block)
+    runs = load_preset(str(tmp_path / "mine.yml")).runs
+    # Five seeds of two settings, on two tasks at two rates and on one at its own
+    assert len(runs) == 5 * 2 * (2 + 2 + 1)
+    for run in runs:
+        constructor_arguments(run)
+
+
 def test_the_environments_page_has_every_task():
     from sb3_ctco.envs import DM_CONTROL_TASKS
 
