@@ -363,7 +363,7 @@ def test_kill_9_loses_only_the_runs_in_flight(tmp_path):
     study.send_signal(signal.SIGKILL)
     study.wait()
     # Its workers end with it, whatever they are at.
-    wait_for(lambda: worker not in processes() or not open_files(worker), 10)
+    wait_for(lambda: worker not in processes() or not open_files(worker))
     assert not any(runs.is_running(path) for path in folder.iterdir())
     # Of other processes there may be some that began meanwhile; joblib, loky, multiprocessing and torch have names.
     left = [name for name in set(os.listdir("/dev/shm")) - shared if "loky" in name or "joblib" in name]

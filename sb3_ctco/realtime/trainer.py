@@ -441,10 +441,12 @@ def _meaning(model: OffPolicyAlgorithm) -> dict[str, Any]:
     space = model.observation_space
     leaves = space.spaces if isinstance(space, spaces.Dict) else {"": space}
     actions: Any = model.action_space
-    options: dict[str, str] | None = None
+    options: dict[str, Any] | None = None
     if isinstance(model, OptionOffPolicyAlgorithm):
         actions = model.primitive_action_space
-        options = {name: str(value) for name, value in model.option_space.arguments.items()}
+        # A trajectory that is no name is a class, of which JSON keeps the name.
+        arguments = model.option_space.arguments
+        options = {name: value if isinstance(value, int | float | str) else str(value) for name, value in arguments.items()}
     return {
         "algorithm": type(model).__name__,
         "options": options,
