@@ -30,6 +30,9 @@ from sb3_ctco.realtime import trainer as trainer_module
 from sb3_ctco.realtime.weights import SharedWeights
 from sb3_ctco.wrappers import RealTimeOptionWrapper
 
+# Processes that start and stop
+pytestmark = pytest.mark.slow
+
 
 class Point(gym.Env):
     """A point moved by its velocity; every command is kept."""

@@ -280,6 +280,7 @@ def test_a_run_leaves_its_settings_versions_episodes_and_record(finished):
     assert 1.0 <= record["decision_rate_hz"] <= 50.0
 
 
+@pytest.mark.slow
 def test_finished_runs_are_skipped_and_broken_ones_begin_again(finished, tmp_path, capsys):
     preset, original = finished
     folder = tmp_path / "study"
@@ -303,6 +304,7 @@ def test_a_folder_with_other_settings_is_refused(finished, tmp_path, capsys):
     assert "eval_episodes: 1 there, 2 in the preset. Name another --folder, or delete" in capsys.readouterr().err
 
 
+@pytest.mark.slow
 def test_a_failed_run_is_recorded_and_stops_no_other(tmp_path, capsys):
     bad = {"setting": "bad", "arguments": {"gamma": 0.98, "gamma_dt": 0.05, "updates_per_second": 20, "d_max": -1.0}}
     good = yaml.safe_load(Path(tiny(tmp_path)).read_text())["algorithms"]["ctco"]
@@ -319,6 +321,7 @@ def test_a_failed_run_is_recorded_and_stops_no_other(tmp_path, capsys):
     assert "failed  point_mass-ctco_bad-50hz-seed0: ValueError: d_max" in capsys.readouterr().out
 
 
+@pytest.mark.slow
 def test_two_studies_on_one_folder(finished, tmp_path, capsys):
     """What one is at, the other leaves alone, and says so."""
     preset, original = finished
@@ -375,6 +378,7 @@ def test_kill_9_loses_only_the_runs_in_flight(tmp_path):
     assert {file: file.stat().st_mtime_ns for file in done} == done
 
 
+@pytest.mark.slow
 def test_a_study_shares_no_memory_and_no_semaphores(tmp_path):
     """So that none can be left behind, however all of its processes end."""
     preset, folder = tiny(tmp_path, seeds=1), tmp_path / "study"
@@ -386,6 +390,7 @@ def test_a_study_shares_no_memory_and_no_semaphores(tmp_path):
     assert used == set()
 
 
+@pytest.mark.slow
 def test_a_run_of_another_study_is_tried_again_at_the_end(finished, tmp_path, capsys):
     """For that study may have been killed meanwhile."""
     preset, original = finished
@@ -402,6 +407,7 @@ def test_a_run_of_another_study_is_tried_again_at_the_end(finished, tmp_path, ca
     assert list(outcomes) == []
 
 
+@pytest.mark.slow
 def test_a_run_whose_process_always_dies_fails(finished, tmp_path, monkeypatch):
     preset, original = finished
     folder = tmp_path / "study"
@@ -475,6 +481,7 @@ def open_files(pid: int) -> set[str]:
 # --- records and figures
 
 
+@pytest.mark.slow
 def test_a_native_task_runs_at_its_own_rate(tmp_path):
     """Any Gymnasium id, and its plain sum of rewards beside the discounted return."""
     arguments = {"gamma": 0.99, "gamma_dt": 0.05, "updates_per_second": 0.1, "learning_starts_seconds": 20, "batch_size": 8}
@@ -541,6 +548,7 @@ def write_csv(file: Path, records: list[dict]) -> Path:
     return file
 
 
+@pytest.mark.slow
 def test_collect_merges_and_skip_records_skips(finished, tmp_path, capsys):
     preset, folder = finished
     into = tmp_path / "results" / "tiny.csv"
@@ -639,6 +647,7 @@ def test_the_table_stands_beside_the_papers_numbers():
     assert "; 1 to 2 seeds; " in plots.table(synthetic()[1:], {})
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("few_resamples")
 def test_plot_of_a_csv_file_and_of_a_folder(finished, tmp_path, capsys):
     file = write_csv(tmp_path / "quick.csv", synthetic())
@@ -652,6 +661,7 @@ def test_plot_of_a_csv_file_and_of_a_folder(finished, tmp_path, capsys):
     assert "FiGAR-SAC (large)" in (tmp_path / "figures" / "frequency.svg").read_text()
 
 
+@pytest.mark.slow
 def test_learning_curves_of_a_folder_and_of_a_csv_file(finished, tmp_path, capsys):
     _, folder = finished
     assert main(["collect", str(folder), "--into", str(tmp_path / "tiny.csv")]) == 0
