@@ -17,3 +17,5 @@ html_title = f"sb3-ctco {__version__}"
 autodoc_member_order = "bysource"
 autodoc_typehints = "signature"
 autodoc_class_signature = "mixed"
+html_static_path = ["_static"]
+html_css_files = ["tables.css"]

@@ -436,8 +436,8 @@ def _as_policy(policy: Any, deterministic: bool, vec_normalize: Any) -> OptionPo
 def _algorithm_of(path: Path) -> "type[OptionOffPolicyAlgorithm]":
     """The class that saved a file, by a setting that only it has; nothing of the file is run to find out."""
     # Imported here, because an exported policy needs none of this.
-    from sb3_ctco.ctco import CTCO  # noqa: PLC0415
-    from sb3_ctco.figar_sac import FiGARSAC  # noqa: PLC0415
+    from sb3_ctco.common.option_algorithm import OptionOffPolicyAlgorithm  # noqa: PLC0415
+    from sb3_ctco.registry import ALGORITHMS  # noqa: PLC0415
 
     # As Stable-Baselines3 does: the ending may be left out.
     file = path if path.exists() else path.with_name(f"{path.name}.zip")
@@ -448,10 +448,10 @@ def _algorithm_of(path: Path) -> "type[OptionOffPolicyAlgorithm]":
             settings = json.loads(archive.read("data"))
     except (zipfile.BadZipFile, KeyError, ValueError) as error:
         raise ValueError(f"{file} is damaged or no model of Stable-Baselines3: {error}") from error
-    if "n_repetitions" in settings:
-        return FiGARSAC
-    if "n_rbf" in settings and "high_freq_penalty" in settings:
-        return CTCO
+    by_options = [row.zoo_class for row in ALGORITHMS.values() if row.zoo_class is not None]
+    for algorithm in by_options:
+        if issubclass(algorithm, OptionOffPolicyAlgorithm) and algorithm._own_setting in settings:
+            return algorithm
     raise TypeError(
         f"{file} was not saved by CTCO or FiGARSAC: load it with its own class, and pass the model if it decides by options; "
         "one of fixed rate, such as SAC or DACPPO, has its action from model.predict"

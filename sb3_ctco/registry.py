@@ -49,7 +49,7 @@ class Task:
 
         :raises ValueError: if it has another rate, and no choice
         """
-        timing = {"dt": 1.0 / rate, "time_limit": self.episode_seconds} if self.any_rate else {}
+        timing: dict[str, Any] = {"dt": 1.0 / rate, "time_limit": self.episode_seconds} if self.any_rate else {}
         env = gym.make(self.env_id, disable_env_checker=True, **self.env_kwargs, **timing)
         dt = find_dt(env)
         if dt is None or not math.isclose(dt, 1.0 / rate, rel_tol=1e-3):

@@ -33,13 +33,14 @@ except ImportError as error:  # pragma: no cover
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.vec_env import VecEnv
 
+from sb3_ctco import registry
 from sb3_ctco.common.option_algorithm import OptionOffPolicyAlgorithm
-from sb3_ctco.ctco import CTCO
-from sb3_ctco.dac_ppo import DACPPO
-from sb3_ctco.figar_sac import FiGARSAC
+from sb3_ctco.envs.quiet import mute_deprecated_attributes
 
 #: The package's algorithms by their names in the Zoo.
-ALGORITHMS: dict[str, type[BaseAlgorithm]] = {"ctco": CTCO, "dac_ppo": DACPPO, "figar_sac": FiGARSAC}
+ALGORITHMS: dict[str, type[BaseAlgorithm]] = {
+    name: row.zoo_class for name, row in registry.ALGORITHMS.items() if row.zoo_class is not None
+}
 
 WRAPPER = "sb3_ctco.wrappers.OptionExecutionWrapper"
 
@@ -175,6 +176,7 @@ def main(arguments: Sequence[str]) -> None:
     :param arguments: ``"train"``, ``"tune"`` or ``"enjoy"``, then RL Zoo's flags
     """
     command, *flags = arguments
+    mute_deprecated_attributes()
     argv, manager = sys.argv, rl_zoo3.train.ExperimentManager
     sys.argv = [f"sb3-ctco {command}", *with_defaults(command, flags)]
     rl_zoo3.train.ExperimentManager = OptionExperimentManager  # type: ignore[misc]

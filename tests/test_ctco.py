@@ -162,7 +162,7 @@ def test_paper_entropies_need_the_papers_durations():
 
 def test_the_critics_see_what_is_played(random_walk_env):
     """Of one step the first of two weights is all: options that differ in the other have one value, and no gradient by it."""
-    model = make(random_walk_env(), n_rbf=2, d_max=0.5, trajectory="bezier").learn(40)
+    model = make(random_walk_env(), n_rbf=2, d_max=0.5, trajectory="bezier", canonical_weights=True).learn(40)
     obs = th.zeros(2, 2)
     options = th.tensor([[0.3, 0.9, -1.0], [0.3, -0.4, -1.0]], requires_grad=True)  # of one step
     values = model.critic(obs, model._as_critics_see(options))
@@ -172,8 +172,27 @@ def test_the_critics_see_what_is_played(random_walk_env):
     longer = th.tensor([[0.3, 0.9, 1.0]])
     th.testing.assert_close(model._as_critics_see(longer), longer)
     # Where the shortest option has two steps, there is nothing to do.
-    assert make(random_walk_env(), n_rbf=2, d_min=0.2).canonical_options is None
-    assert make(random_walk_env(), n_rbf=2, canonical_weights=False).canonical_options is None
+    assert make(random_walk_env(), n_rbf=2, d_min=0.2, canonical_weights=True).canonical_options is None
+    assert make(random_walk_env(), n_rbf=2).canonical_options is None
+
+
+def test_what_was_counted_goes_on_after_loading(tmp_path, random_walk_env):
+    model = make(random_walk_env(), target_decision_rate=5.0).learn(60)
+    counted = model._counted_decisions
+    assert counted[0] > 0
+    model.save(tmp_path / "model")
+    model.save_replay_buffer(tmp_path / "buffer")
+    loaded = CTCO.load(tmp_path / "model", env=random_walk_env())
+    loaded.load_replay_buffer(tmp_path / "buffer")
+    assert tuple(loaded._counted_decisions) == counted
+    before = loaded.log_high_freq_penalty.item()
+    loaded._update_high_freq_penalty()  # no decision since
+    assert loaded.log_high_freq_penalty.item() == before
+
+
+def test_the_temperature_has_sacs_name(random_walk_env):
+    model = make(random_walk_env(), ent_coef="auto_0.5").learn(30)
+    th.testing.assert_close(model.log_ent_coef, model.log_ent_coefs[:1].detach())
 
 
 def test_what_a_decision_costs_is_logged(random_walk_env):
@@ -415,7 +434,6 @@ def test_one_update_by_hand(random_walk_env):
         ent_coef=0.2,
         duration_ent_coef=0.4,
         high_freq_penalty=0.05,
-        canonical_weights=False,
     )
     model.learn(200)
     # Let the targets differ from what they follow.

@@ -112,3 +112,16 @@ def test_make_demo_says_what_it_does_before_it_does_it(tmp_path):
 
 def test_make_test_fast_leaves_out_what_is_slow(tmp_path):
     assert '-m "not slow" tests' in commands_of("test-fast", tmp_path)
+
+
+def test_our_commands_do_not_repeat_what_gymnasiums_models_make_mujoco_say():
+    code = (
+        "from sb3_ctco.envs.quiet import mute_deprecated_attributes; mute_deprecated_attributes()\n"
+        "import gymnasium as gym; gym.make('HalfCheetah-v5')\n"
+        "import mujoco; model = mujoco.MjModel.from_xml_string("
+        "'<mujoco><worldbody><body><freejoint/><geom size=\"1\"/></body></worldbody></mujoco>')\n"
+        "data = mujoco.MjData(model); data.qpos[0] = float('nan'); mujoco.mj_step(model, data)\n"
+    )
+    run = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert "settotalmass" not in run.stdout + run.stderr
+    assert "Nan, Inf or huge value in QPOS" in run.stderr  # others stay

@@ -50,7 +50,6 @@ def test_deviations_are_those_of_the_code():
         "n_rbf",
         "high_freq_penalty",
         "entropy_reference",
-        "canonical_weights",
         "policy_kwargs",
         # What the class has, too, and must stay if its defaults change
         "reward_scale",

@@ -169,6 +169,11 @@ class SoftOptionActorCritic(OptionOffPolicyAlgorithm):
         """What makes the updates of a training: :meth:`_update`, or something faster that computes the same."""
         yield self._update
 
+    @property
+    def log_ent_coef(self) -> th.Tensor:
+        """The logarithm of the temperature of what to do, ``[1]``, under the name that Stable-Baselines3's SAC has for it."""
+        return self.log_ent_coefs.detach()[:1]
+
     def _update(self, data: ReplayBufferSamples) -> th.Tensor:
         """One update of temperatures, critics, actor and targets.
 

@@ -41,8 +41,7 @@ class CTCO(SoftOptionActorCritic):
     Where it differs from the paper, the paper's way is an argument away: entropy counts relative to the uniform
     distribution (``entropy_reference="paper"``), two critics (``policy_kwargs=dict(n_critics=1)``), a temperature each
     for ω and d, learned (pass numbers; the same one twice is the paper's β_E), ω squashed by tanh so that actions stay
-    in their bounds, a shortest duration of one step (the paper's durations are in (0, d_max)), and critics that see what
-    short options play (``canonical_weights=False``).
+    in their bounds, and a shortest duration of one step (the paper's durations are in (0, d_max)).
 
     Settings that the paper's algorithm would have are in :meth:`paper_defaults`; the class's own were measured to learn
     faster on the paper's tasks.
@@ -106,11 +105,6 @@ class CTCO(SoftOptionActorCritic):
 
     _own_setting: ClassVar[str] = "high_freq_penalty"
 
-    _before_it_was_saved: ClassVar[dict[str, Any]] = {
-        **SoftOptionActorCritic._before_it_was_saved,
-        "canonical_weights": False,
-    }
-
     policy_aliases: ClassVar[dict[str, type[BasePolicy]]] = {
         "MlpPolicy": MlpPolicy,
         "CnnPolicy": CnnPolicy,
@@ -153,7 +147,7 @@ class CTCO(SoftOptionActorCritic):
         target_entropy_anneal: float = 0.0,
         duration_learning_rate: float | Schedule | None = None,
         entropy_reference: EntropyReference = "uniform",
-        canonical_weights: bool = True,
+        canonical_weights: bool = False,
         fast_updates: bool = True,
         action_noise: ActionNoise | None = None,
         replay_buffer_class: type[ReplayBuffer] | None = None,
@@ -258,7 +252,6 @@ class CTCO(SoftOptionActorCritic):
             "trajectory": "rbf",
             "duration_scale": "linear",
             "entropy_reference": "paper",
-            "canonical_weights": False,
             "policy_kwargs": {"n_critics": 1, "net_arch": {"pi": [10, 10], "qf": [64, 64]}},
         }
 
@@ -276,8 +269,8 @@ class CTCO(SoftOptionActorCritic):
             assert isinstance(self.high_freq_penalty, int | float)
             self.log_high_freq_penalty = th.tensor(math.log(self.high_freq_penalty), requires_grad=True)
             self.high_freq_penalty_optimizer = th.optim.Adam([self.log_high_freq_penalty], lr=self.lr_schedule(1))
-            #: What the replay buffer had counted at the last training: decisions, and their time in s.
-            self._counted_decisions = (0, 0.0)
+            #: What the replay buffer had counted at the last training: decisions, and their time in s; a file's goes on.
+            self._counted_decisions: tuple[int, float] = getattr(self, "_counted_decisions", (0, 0.0))
         self._last_next_values: tuple[th.Tensor, th.Tensor] | None = None
         assert self.d_min is not None
         # Read from the batch where it is "average"

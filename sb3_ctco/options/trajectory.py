@@ -107,7 +107,7 @@ class BezierCurve(Trajectory):
     def basis(self, phase: FloatArray) -> FloatArray:
         """Shape ``[n_steps, n_weights]``, see :meth:`Trajectory.basis`."""
         x, i = np.asarray(phase)[:, None], np.arange(self.n_weights)
-        binomials = [math.comb(self.n_weights - 1, k) for k in i]
+        binomials = np.array([math.comb(self.n_weights - 1, k) for k in i], dtype=np.float64)
         return binomials * x**i * (1.0 - x) ** (self.n_weights - 1 - i)
 
 

@@ -162,7 +162,7 @@ class JournalReader:
 
     def __init__(self, folder: Path):
         self.folder = folder
-        self._number = -1
+        self._number, self._is_complete = -1, False
         if not self._open_next():
             raise FileNotFoundError(f"there is no journal in {folder}")
 

@@ -45,7 +45,7 @@ class Transition(NamedTuple):
     def to_arrays(self) -> Arrays:
         """As a record of the journal, with what a replay buffer uses of the one environment's info."""
         (info,) = self.infos
-        kept = {name: info[name] for name in ("TimeLimit.truncated", "option") if name in info}
+        kept: dict[str, Any] = {name: info[name] for name in ("TimeLimit.truncated", "option") if name in info}
         if "sub_options" in info:
             kept["sub_options"] = _fields(info["sub_options"])
         return {**self._asdict(), "infos": kept}

@@ -438,13 +438,16 @@ class _JournalBuffer:
 
 def _meaning(model: OffPolicyAlgorithm) -> dict[str, Any]:
     """What a model's transitions mean, by which another one may or may not learn from them."""
-    is_option = isinstance(model, OptionOffPolicyAlgorithm)
     space = model.observation_space
     leaves = space.spaces if isinstance(space, spaces.Dict) else {"": space}
-    actions: Any = model.primitive_action_space if is_option else model.action_space
+    actions: Any = model.action_space
+    options: dict[str, str] | None = None
+    if isinstance(model, OptionOffPolicyAlgorithm):
+        actions = model.primitive_action_space
+        options = {name: str(value) for name, value in model.option_space.arguments.items()}
     return {
         "algorithm": type(model).__name__,
-        "options": {name: str(value) for name, value in model.option_space.arguments.items()} if is_option else None,
+        "options": options,
         "actions": {"low": actions.low.tolist(), "high": actions.high.tolist()},
         "observations": {name: [list(leaf.shape or ()), str(leaf.dtype)] for name, leaf in leaves.items()},
     }

@@ -35,7 +35,7 @@ class SharedWeights:
         flat = np.concatenate([_bytes_of(tensor) for tensor in module.state_dict().values()])
         self._version.value += 1
         self._array()[:] = flat
-        self._checksum.value = zlib.crc32(flat)
+        self._checksum.value = zlib.crc32(flat.data)
         self._published_at.value = time.monotonic()
         self._version.value += 1
 

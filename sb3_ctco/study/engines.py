@@ -11,6 +11,7 @@ from multiprocessing.connection import Connection, wait
 from multiprocessing.process import BaseProcess
 from pathlib import Path
 
+from sb3_ctco.envs.quiet import mute_deprecated_attributes
 from sb3_ctco.study.grid import Run
 from sb3_ctco.study.runs import Outcome, perform, record_failure
 
@@ -43,8 +44,9 @@ def run_local(runs: Sequence[Run], folder: Path, workers: int) -> Iterator[Outco
                 at_work[connection] = process, waiting.popleft()
                 with contextlib.suppress(BrokenPipeError):  # it has died, as is found below
                     connection.send(at_work[connection][1])
-            for connection in wait(list(at_work)):
-                assert isinstance(connection, Connection)
+            for ready in wait(list(at_work)):
+                assert isinstance(ready, Connection)
+                connection = ready
                 process, run = at_work.pop(connection)
                 try:
                     outcome: Outcome = connection.recv()
@@ -92,6 +94,7 @@ def _start_worker(folder: Path) -> tuple[Connection, BaseProcess]:
 
 
 def _work(connection: Connection, folder: Path) -> None:
+    mute_deprecated_attributes()
     threading.Thread(target=_end_with_the_study, daemon=True).start()
     # Until the study closes its end, or somebody presses Ctrl-C, which reaches every process of the terminal.
     with contextlib.suppress(EOFError, KeyboardInterrupt):
