@@ -192,6 +192,9 @@ class _Learner:
             if now - saved_at > settings.checkpoint_seconds:
                 self.save()
                 saved_at = now
+        # So that the checkpoint says how far acting got.
+        while fill_replay_buffer(model, self.journal, 1000):
+            pass
 
     def save(self) -> None:
         """Write a checkpoint, in one move."""
