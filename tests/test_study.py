@@ -362,7 +362,7 @@ def test_kill_9_loses_only_the_runs_in_flight(tmp_path):
     study.send_signal(signal.SIGKILL)
     study.wait()
     # Its workers end with it, whatever they are at.
-    wait_for(lambda: not any(runs.is_running(path) for path in folder.iterdir()), 10)
+    wait_for(lambda: not any(runs.is_running(path) for path in folder.iterdir()))
     # Of other processes there may be some that began meanwhile.
     left = [name for name in set(os.listdir("/dev/shm")) - shared if "loky" in name or "joblib" in name]
     assert not left
