@@ -181,14 +181,14 @@ def test_actor_uses_new_weights_while_it_acts(tmp_path):
 
     def watch(local_variables, global_variables):
         seen.append(float((model.policy.actor.latent_pi[0].weight.detach() - first).abs().max()))
-        return True
+        # However long the learner takes on a machine that is busy.
+        return len(set(seen)) <= 5
 
     with AsynchronousTrainer(model, env, tmp_path) as trainer:
-        trainer.learn(150, watch)
-        assert len(trainer.decision_seconds) == len(trainer.weight_ages) == 150
+        trainer.learn(3000, watch)
+        assert len(trainer.decision_seconds) == len(trainer.weight_ages) == len(seen)
     assert seen[20] == 0.0
-    assert seen[-1] > 0.0
-    assert len(set(seen)) > 5
+    assert len(set(seen)) == 6
 
 
 def test_resume_continues_with_all_that_was_collected(tmp_path):
@@ -672,7 +672,7 @@ def test_kill_9_of_acting_leaves_nothing_in_the_system_and_all_in_the_folder(tmp
 def test_bad_arguments_are_refused_before_anything_is_made(tmp_path, arguments, message):
     env = Point()
     with pytest.raises((ValueError, TypeError), match=message):
-        AsynchronousTrainer(make_model(CTCO, env), env, tmp_path / "run", **arguments)
+        AsynchronousTrainer(make_model(CTCO, env, d_max=1.0), env, tmp_path / "run", **arguments)
     assert env.commands == []
     assert not (tmp_path / "run" / "journal").exists()
 

@@ -362,13 +362,11 @@ def test_kill_9_loses_only_the_runs_in_flight(tmp_path):
     shared = set(os.listdir("/dev/shm"))
     study = subprocess.Popen([*COMMAND, *arguments], stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
     wait_for(lambda: len(list(folder.glob("*/record.json"))) >= 2)
-    worker = worker_at_work(study.pid, folder)
     study.send_signal(signal.SIGKILL)
     study.wait()
     # Its workers end with it, whatever they are at.
-    wait_for(lambda: worker not in processes() or not open_files(worker))
-    assert not any(runs.is_running(path) for path in folder.iterdir())
-    # Of other processes there may be some that began meanwhile; joblib, loky, multiprocessing and torch have names.
+    wait_for(lambda: not any(runs.is_running(path) for path in folder.iterdir()))
+    # Of other processes there may be some that began meanwhile.
     left = [name for name in set(os.listdir("/dev/shm")) - shared if "loky" in name or "joblib" in name]
     assert not left
     done = {file: file.stat().st_mtime_ns for file in folder.glob("*/record.json")}

@@ -192,8 +192,8 @@ class _Learner:
             if now - saved_at > settings.checkpoint_seconds:
                 self.save()
                 saved_at = now
-        # What was collected since the last look: the checkpoint tells how far it is.
-        while fill_replay_buffer(model, self.journal, 1000) == 1000:
+        # So that the checkpoint says how far acting got.
+        while fill_replay_buffer(model, self.journal, 1000):
             pass
 
     def save(self) -> None:
