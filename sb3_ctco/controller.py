@@ -137,10 +137,17 @@ def to_metadata(settings: OptionSpace, action_space: spaces.Box, observations: d
     """What an exported policy's options mean, as a line of JSON.
 
     :param observations: shape and dtype of each observation, by the name of the file's input
+    :raises ValueError: if the trajectory has no name, by which the file's reader would know it
     """
+    arguments = settings.arguments
+    if not isinstance(arguments["trajectory"], str):
+        raise ValueError(
+            f"an exported policy names its trajectory, and {arguments['trajectory'].__name__} has no name: give it one, "
+            f"sb3_ctco.options.TRAJECTORIES['name'] = {arguments['trajectory'].__name__}, here and where the file is read"
+        )
     return json.dumps(
         {
-            "option_space": settings.arguments,
+            "option_space": arguments,
             "action_low": action_space.low.tolist(),
             "action_high": action_space.high.tolist(),
             "action_dtype": str(action_space.dtype),

@@ -13,9 +13,9 @@ from stable_baselines3 import SAC
 from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 
 from sb3_ctco import CTCO, DACPPO, FiGARSAC, OptionController, OptionExecutionWrapper
-from sb3_ctco.controller import OnnxPolicy
+from sb3_ctco.controller import OnnxPolicy, to_metadata
 from sb3_ctco.export import export_onnx
-from sb3_ctco.options import OptionSpace
+from sb3_ctco.options import OptionSpace, RadialBasis
 
 DT = 0.1
 SETTINGS = OptionSpace.make(n_rbf=1, d_max=0.4, d_min=DT, dt=DT, discount_rate=0.4)
@@ -480,3 +480,13 @@ def test_a_controller_can_be_pickled(pendulum_model):
     assert controller.option.shape == (3,)
     copy = pickle.loads(pickle.dumps(controller))
     assert copy.remaining == controller.remaining
+
+
+def test_a_trajectory_without_a_name_cannot_be_exported():
+    class Line(RadialBasis):
+        """A class that no file can name."""
+
+    space = OptionSpace.make(2, 0.4, 0.1, 0.1, 0.4, Line)
+    box = gym.spaces.Box(-1.0, 1.0, (1,))
+    with pytest.raises(ValueError, match=r"Line has no name: give it one, sb3_ctco.options.TRAJECTORIES"):
+        to_metadata(space, box, {"observation": ((2,), "float32")})
