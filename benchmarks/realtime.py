@@ -4,7 +4,7 @@
 
 A simulated machine that does nothing, controlled at 500 Hz by CTCO (or ``--algorithm sac``), with the learner at full
 speed in its own process. Prints what was measured, as one JSON object: the share of ticks that were late by more than
-1 ms, updates a second, the age of the weights that decisions were made with, and how long a decision took.
+1 ms, updates per second, the age of the weights that decisions were made with, and how long a decision took.
 """
 
 import argparse

@@ -2,9 +2,9 @@
 
     python benchmarks/training.py
 
-Both play the same environment (ball in cup), make 20 updates a second of task time with the paper's networks and batches, and
-use one thread; they take turns, and the ratio is the median over the repeats. CTCO decides as its untrained policy does, two
-to three times a second.
+Both play the same environment (ball in cup), make 20 updates per second of task time with the paper's networks and
+batches, and use one thread; they take turns, and the ratio is the median over the repeats. CTCO decides as its untrained
+policy does, two to three times a second.
 """
 
 import argparse

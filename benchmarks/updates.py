@@ -1,4 +1,4 @@
-"""Gradient updates a second, against Stable-Baselines3's SAC with the same networks, batch and optimizer.
+"""Gradient updates per second, against Stable-Baselines3's SAC with the same networks, batch and optimizer.
 
     python benchmarks/updates.py
 

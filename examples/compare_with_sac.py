@@ -134,7 +134,7 @@ def main() -> None:
     parser.add_argument("--learning-starts", type=int, default=1000)
     parser.add_argument("--batch-size", type=int, default=128)
     parser.add_argument("--train-freq", type=int, default=1, help="environment steps between two trainings")
-    parser.add_argument("--gradient-steps", type=int, default=-1, help="updates a training; -1 is one a step")
+    parser.add_argument("--gradient-steps", type=int, default=-1, help="updates per training; -1 is one a step")
     parser.add_argument("--d-max", type=float, default=0.3, help="CTCO's longest option, s")
     parser.add_argument("--eval-episodes", type=int, default=20)
     parser.add_argument("--window", type=int, default=10, help="episodes that a point of the curves averages")

@@ -78,7 +78,7 @@ def main() -> None:
     print(
         f"CTCO learns {env_id} at {1 / args.dt:.0f} Hz for {args.seconds:.0f} s of task time: {steps:,} steps of "
         f"{args.dt} s,\n"
-        f"played as options of up to {model.d_max} s, with {model.updates_per_second} updates a second of task time."
+        f"played as options of up to {model.d_max} s, with {model.updates_per_second} updates per second of task time."
     )
     curve = DiscountedReturnCallback(model.discount_rate)
     model.learn(steps, curve, progress_bar=True)

@@ -3,7 +3,7 @@
     python examples/visual_reacher.py --algorithm ctco --difficulty easy --seed 0
     python examples/visual_reacher.py --algorithm sac --difficulty easy --seed 0
 
-runs in simulated time, with a fixed number of updates a second of task time, which a seed makes repeatable. With
+runs in simulated time, with a fixed number of updates per second of task time, which a seed makes repeatable. With
 ``--asynchronous`` acting keeps the wall clock and learning takes place in a process of its own.
 
 One row an episode goes to FOLDER/<algorithm>_<difficulty>_<rate>hz_seed<seed>.csv (task time in s, discounted return,

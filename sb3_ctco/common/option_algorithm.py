@@ -72,8 +72,8 @@ class OptionOffPolicyAlgorithm(OffPolicyAlgorithm):
     :param gamma: discount factor over ``gamma_dt`` seconds, in (0, 1]
     :param gamma_dt: in s
     :param train_freq: collect at least this many primitive steps (in each environment) between trainings
-    :param gradient_steps: updates a training; -1 for as many as primitive steps were collected
-    :param updates_per_second: updates a second of task time, the paper's "fixed number of updates per time unit",
+    :param gradient_steps: updates per training; -1 for as many as primitive steps were collected
+    :param updates_per_second: updates per second of task time, the paper's "fixed number of updates per time unit",
         in place of ``gradient_steps``; a fraction is carried over
     :param n_sub_options: how many random stretches of each option go into the replay buffer beside it; environments that
         are wrapped already are told

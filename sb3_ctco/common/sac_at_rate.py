@@ -53,7 +53,7 @@ def sac_at_rate(
     :param env: the environment to learn from: a Gymnasium id, a bare environment, one in a ``RewardRateWrapper``, or a
         VecEnv of such
     :param dt: the environment's interaction period, in s
-    :param updates_per_second: updates a second of task time, summed over the environments of a VecEnv
+    :param updates_per_second: updates per second of task time, summed over the environments of a VecEnv
     :param gamma: discount factor over ``gamma_dt`` seconds, in (0, 1]
     :param gamma_dt: in s
     :param learning_starts_seconds: act at random for this long before learning, in s of task time

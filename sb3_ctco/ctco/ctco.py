@@ -59,8 +59,8 @@ class CTCO(SoftOptionActorCritic):
     :param gamma: discount factor over ``gamma_dt`` seconds, in (0, 1]; it means the same at every ``dt``
     :param gamma_dt: in s
     :param train_freq: collect at least this many steps between trainings, or ``(n, "episode")``
-    :param gradient_steps: updates a training; -1 for one a step; 1 (with ``train_freq=1``) for the paper's Algorithm 1
-    :param updates_per_second: updates a second of task time, in place of ``gradient_steps``
+    :param gradient_steps: updates per training; -1 for one a step; 1 (with ``train_freq=1``) for the paper's Algorithm 1
+    :param updates_per_second: updates per second of task time, in place of ``gradient_steps``
     :param n_sub_options: how many random stretches of each option that was played go into the replay buffer beside it,
         as options of their own, which counts in ``buffer_size``; 0 is the paper's way
     :param n_rbf: number of radial basis functions an action dimension

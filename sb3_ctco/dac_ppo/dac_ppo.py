@@ -59,7 +59,7 @@ class DACPPO(OnPolicyAlgorithm):
     :param n_steps: steps in each environment between trainings
     :param batch_size: steps in a minibatch
     :param n_epochs: epochs a training, for each of the two processes; 5 by default
-    :param updates_per_second: updates a second of task time, in place of ``n_epochs``: half of them for each process;
+    :param updates_per_second: updates per second of task time, in place of ``n_epochs``: half of them for each process;
         a fraction is carried over
     :param gamma: discount factor over ``gamma_dt`` seconds, in (0, 1]; it means the same at every ``dt``
     :param gamma_dt: in s; None for one step of the environment, whatever time it takes

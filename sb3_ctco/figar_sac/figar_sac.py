@@ -54,8 +54,8 @@ class FiGARSAC(SoftOptionActorCritic):
     :param gamma: discount factor over ``gamma_dt`` seconds, in (0, 1]; it means the same at every ``dt``
     :param gamma_dt: in s
     :param train_freq: collect at least this many steps between trainings, or ``(n, "episode")``
-    :param gradient_steps: updates a training; -1 for one a step
-    :param updates_per_second: updates a second of task time, in place of ``gradient_steps``
+    :param gradient_steps: updates per training; -1 for one a step
+    :param updates_per_second: updates per second of task time, in place of ``gradient_steps``
     :param n_repetitions: K, the longest repetition, in steps; 20 by default
     :param d_max: the longest repetition in s, in place of ``n_repetitions``; rounded to whole steps
     :param dt: interaction period of the environment, in s; by default found in the environment
