@@ -662,7 +662,7 @@ def test_kill_9_of_acting_leaves_nothing_in_the_system_and_all_in_the_folder(tmp
         ({"decide_ahead": -0.1}, "decide_ahead must be a finite number of seconds from 0, not -0.1"),
         ({"decide_ahead": math.nan}, "decide_ahead must be a finite number of seconds from 0, not nan"),
         ({"decide_ahead": math.inf}, "decide_ahead must be a finite number of seconds from 0, not inf"),
-        ({"decide_ahead": 1.0}, r"decide_ahead must be at least 0 s and less than d_max=0.5 s, not 1.0"),
+        ({"decide_ahead": 1.0}, r"decide_ahead must be at least 0 s and less than d_max=1.0 s, not 1.0"),
         ({"safe_stop": None}, "safe_stop must be a function of the bare environment, not None"),
         ({"safe_stop": 0.0}, "safe_stop must be a function of the bare environment, not 0.0"),
         ({"interrupt": 0.1}, "interrupt must be a function or None, not 0.1"),
