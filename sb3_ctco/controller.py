@@ -455,9 +455,9 @@ def _algorithm_of(path: Path) -> "type[OptionOffPolicyAlgorithm]":
             settings = json.loads(archive.read("data"))
     except (zipfile.BadZipFile, KeyError, ValueError) as error:
         raise ValueError(f"{file} is damaged or no model of Stable-Baselines3: {error}") from error
-    by_options = [row.zoo_class for row in ALGORITHMS.values() if row.zoo_class is not None]
-    for algorithm in by_options:
-        if issubclass(algorithm, OptionOffPolicyAlgorithm) and algorithm._own_setting in settings:
+    for row in ALGORITHMS.values():
+        algorithm = row.zoo_class
+        if algorithm is not None and issubclass(algorithm, OptionOffPolicyAlgorithm) and algorithm._own_setting in settings:
             return algorithm
     raise TypeError(
         f"{file} was not saved by CTCO or FiGARSAC: load it with its own class, and pass the model if it decides by options; "
