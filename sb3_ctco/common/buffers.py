@@ -169,12 +169,11 @@ class _OptionStorage(ReplayBuffer):
     def _found_reward_scale(self) -> float:
         if self.reward_scale != "auto":
             return self.reward_scale
-        stored = slice(None if self.full else self.pos)
-        rewards, durations = self.integrated_rewards[stored], self.durations[stored]
-        if not rewards.any():
+        paid = self.integrated_rewards != 0
+        if not paid.any():
             return 1.0  # Nothing was paid so far, so every scale is the same.
         # Without a discount, forever is 100 s.
-        forever = np.abs(rewards) / -np.expm1(-max(self.discount_rate, 0.01) * durations)
+        forever = np.abs(self.integrated_rewards[paid]) / -np.expm1(-max(self.discount_rate, 0.01) * self.durations[paid])
         self.reward_scale = 100.0 / float(forever.max())
         return self.reward_scale
 
