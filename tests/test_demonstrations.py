@@ -1,6 +1,11 @@
 """Recorded trajectories of primitive actions as options, and training that draws a part of each batch from them."""
 
 import math
+import os
+import subprocess
+import sys
+from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -9,6 +14,7 @@ from gymnasium import spaces
 from stable_baselines3.common.save_util import load_from_pkl, save_to_pkl
 
 from sb3_ctco import CTCO, DictOptionReplayBuffer, OptionReplayBuffer
+from sb3_ctco.datasets import lerobot_trajectories, minari_trajectories
 from sb3_ctco.options import OptionSpace, integrated_reward
 
 TAU = math.log(2.0)
@@ -286,3 +292,89 @@ def test_without_demonstrations_batches_are_what_they_were():
     np.random.seed(0)
     rows = np.random.randint(0, 30, size=16)
     th.testing.assert_close(batch.rewards[:, 0], th.tensor(rows, dtype=th.float32))
+
+
+class Episodes:
+    """What of a Minari dataset is used."""
+
+    def __init__(self, *episodes):
+        self.episodes = episodes
+
+    def iterate_episodes(self):
+        return iter(self.episodes)
+
+
+def test_minari_datasets_are_read():
+    observations, actions, rewards = recording(20)
+    no, last = np.zeros(20, bool), np.arange(20) == 19
+    common = {"observations": observations, "actions": actions, "rewards": rewards.tolist()}
+    episodes = [SimpleNamespace(terminations=last, truncations=no, **common)]
+    episodes += [SimpleNamespace(terminations=no, truncations=last, **common)]
+    trajectories = list(minari_trajectories(Episodes(*episodes), dt=0.1))
+    assert [(t.terminated, t.truncated, t.dt) for t in trajectories] == [(True, False, 0.1), (False, True, 0.1)]
+    buffer = make_buffer()
+    assert buffer.add_trajectory(*trajectories[0]).added > 10
+
+
+def test_a_minari_dataset_that_a_script_recorded(tmp_path):
+    """With minari itself, by the example that makes a dataset from SAC."""
+    pytest.importorskip("minari")
+    script = Path(__file__).parents[1] / "examples" / "record_demonstrations.py"
+    arguments = ["--env", "Pendulum-v1", "--steps", "300", "--episodes", "2", "--dataset", "pendulum/sac-v0"]
+    environment = {**os.environ, "MINARI_DATASETS_PATH": str(tmp_path), "PYTHONPATH": str(script.parents[1])}
+    command = [sys.executable, str(script), *arguments]
+    result = subprocess.run(command, capture_output=True, text=True, check=True, env=environment, cwd=tmp_path)
+    assert "pendulum/sac-v0: 2 episodes" in result.stdout
+    os.environ["MINARI_DATASETS_PATH"] = str(tmp_path)
+    try:
+        trajectories = list(minari_trajectories("pendulum/sac-v0", dt=0.05))
+    finally:
+        del os.environ["MINARI_DATASETS_PATH"]
+    model = CTCO("MlpPolicy", "Pendulum-v1", buffer_size=5000)
+    results = [model.replay_buffer.add_trajectory(*trajectory) for trajectory in trajectories]
+    assert [len(trajectory.rewards) for trajectory in trajectories] == [200, 200]
+    assert all(0 < result.added <= 200 for result in results)
+
+
+@pytest.mark.parametrize("one_file_an_episode", [True, False])
+def test_lerobot_datasets_are_read(tmp_path, one_file_an_episode):
+    """Versions 2 and 3 of the format: frames of two episodes of 6 and 4, the second of which is not done."""
+    pyarrow = pytest.importorskip("pyarrow")
+    from pyarrow import parquet
+
+    (tmp_path / "meta").mkdir()
+    (tmp_path / "meta" / "info.json").write_text('{"fps": 20}')
+    folder = tmp_path / "data" / "chunk-000"
+    folder.mkdir(parents=True)
+    episode, frame = np.array([0] * 6 + [1] * 4), np.array([*range(6), *range(4)])
+    order = np.array([3, 1, 2, 0, *range(4, 10)])  # rows need not be in order
+    vectors = pyarrow.list_(pyarrow.float32(), 2)
+    columns = {
+        "episode_index": pyarrow.array(episode[order]),
+        "frame_index": pyarrow.array(frame[order]),
+        "observation.state": pyarrow.array([[10 * episode[k] + frame[k], 0.5] for k in order], vectors),
+        "action": pyarrow.array([[0.1 * frame[k], 0.0] for k in order], pyarrow.list_(pyarrow.float32())),
+        "next.reward": pyarrow.array((1.0 + frame[order]).astype(np.float32)),
+        "next.done": pyarrow.array((frame[order] == 5).tolist()),
+    }
+    table = pyarrow.table(columns)
+    if one_file_an_episode:
+        parquet.write_table(table.slice(0, 6), folder / "episode_000000.parquet")
+        parquet.write_table(table.slice(6), folder / "episode_000001.parquet")
+    else:
+        parquet.write_table(table, folder / "file-000.parquet")
+    first, second = lerobot_trajectories(tmp_path)
+    np.testing.assert_array_equal(first.observations[:, 0], [0, 1, 2, 3, 4, 5, 5])  # the last stands in for none
+    np.testing.assert_array_equal(first.rewards, [1, 2, 3, 4, 5, 6])
+    np.testing.assert_allclose(first.actions[:, 0], 0.1 * np.arange(6), rtol=1e-6)
+    assert (first.terminated, first.truncated, first.dt) == (True, False, 0.05)
+    np.testing.assert_array_equal(second.observations[:, 0], [10, 11, 12, 13])
+    np.testing.assert_array_equal(second.rewards, [1, 2, 3])
+    assert (second.terminated, second.truncated) == (False, True)
+    first, _ = lerobot_trajectories(tmp_path, {"state": "observation.state"}, lambda obs, actions: obs["state"][1:, 0], False)
+    np.testing.assert_array_equal(first.rewards, [1, 2, 3, 4, 5])
+    assert (first.terminated, first.truncated) == (False, True)
+    with pytest.raises(ValueError, match=r"no column observation.images.front, and has .*videos"):
+        next(lerobot_trajectories(tmp_path, "observation.images.front"))
+    with pytest.raises(FileNotFoundError, match=r"meta/info\.json"):
+        next(lerobot_trajectories(tmp_path / "data"))
