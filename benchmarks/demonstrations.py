@@ -20,10 +20,10 @@ import numpy as np
 import torch as th
 
 from sb3_ctco import CTCO
-from sb3_ctco.common.evaluation import DiscountedReturnCallback
-from sb3_ctco.common.spatial_softmax import SpatialSoftmaxExtractor
 from sb3_ctco.datasets import RecordedTrajectory
 from sb3_ctco.envs.visual_reacher.oracle import servo_action
+from sb3_ctco.evaluation import DiscountedReturnCallback
+from sb3_ctco.torch_layers import SpatialSoftmaxExtractor
 
 DT = 0.02
 

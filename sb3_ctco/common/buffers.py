@@ -2,7 +2,7 @@
 
 import dataclasses
 import math
-from typing import Any, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 import torch as th
@@ -11,7 +11,6 @@ from stable_baselines3.common.buffers import DictReplayBuffer, ReplayBuffer
 from stable_baselines3.common.type_aliases import DictReplayBufferSamples, ReplayBufferSamples
 from stable_baselines3.common.vec_env import VecNormalize
 
-from sb3_ctco.common.vec_env import PENDING
 from sb3_ctco.options import (
     DEFAULT_DISCOUNT_RATE,
     REWARD_UNITS,
@@ -25,6 +24,7 @@ from sb3_ctco.options import (
     shortest_steps,
     sub_options,
 )
+from sb3_ctco.vec_env import PENDING
 
 
 class AddedTrajectory(NamedTuple):
@@ -44,7 +44,7 @@ class _OptionStorage(ReplayBuffer):
     """What the two option buffers add to their Stable-Baselines3 base."""
 
     #: Of buffers that were saved without these
-    reward_scale = 1.0
+    reward_scale: float | Literal["auto"] = 1.0
     demonstration_fraction = 0.5
     n_demonstrations = 0
     option_space: OptionSpace | None = None
@@ -60,7 +60,7 @@ class _OptionStorage(ReplayBuffer):
         optimize_memory_usage: bool = False,
         handle_timeout_termination: bool = True,
         discount_rate: float = DEFAULT_DISCOUNT_RATE,
-        reward_scale: float = 1.0,
+        reward_scale: float | Literal["auto"] = 1.0,
         demonstration_fraction: float = 0.5,
         option_space: OptionSpace | None = None,
         primitive_action_space: spaces.Box | None = None,
@@ -83,7 +83,7 @@ class _OptionStorage(ReplayBuffer):
             handle_timeout_termination=handle_timeout_termination,
         )
         self.discount_rate = float(discount_rate)
-        self.reward_scale = float(reward_scale)
+        self.reward_scale = reward_scale
         self.demonstration_fraction = float(demonstration_fraction)
         self.option_space = option_space
         self.primitive_action_space = primitive_action_space
@@ -116,7 +116,7 @@ class _OptionStorage(ReplayBuffer):
 
         :param infos: each with ``info["option"]`` of :class:`~sb3_ctco.wrappers.OptionExecutionWrapper`, and
             ``info["sub_options"]`` if it hands over any; nothing is stored of environments whose option runs on
-            (``info["pending"]`` of :class:`~sb3_ctco.common.vec_env.AsyncOptionVecEnv`)
+            (``info["pending"]`` of :class:`~sb3_ctco.vec_env.AsyncOptionVecEnv`)
         :raises ValueError: if that is missing, not finite, or was discounted at another rate, or if sub-options saw other
             observations than these; nothing is stored then
         """
@@ -320,9 +320,21 @@ class _OptionStorage(ReplayBuffer):
             "actions": self._tensor(rows(self.actions)),
             "next_observations": observations(self.next_observations),
             "dones": self._tensor(dones[:, None]),
-            "rewards": self._tensor(rows(self.integrated_rewards)[:, None]) * self.reward_scale,
+            "rewards": self._tensor(rows(self.integrated_rewards)[:, None]) * self._found_reward_scale(),
             "discounts": self._tensor(discount(rows(self.durations), self.discount_rate)[:, None]),
         }
+
+    def _found_reward_scale(self) -> float:
+        if self.reward_scale != "auto":
+            return self.reward_scale
+        stored = slice(None if self.full else self.pos)
+        rewards, durations = self.integrated_rewards[stored], self.durations[stored]
+        if not rewards.any():
+            return 1.0  # Nothing was paid so far, so every scale is the same.
+        # Without a discount, forever is 100 s.
+        forever = np.abs(rewards) / -np.expm1(-max(self.discount_rate, 0.01) * durations)
+        self.reward_scale = 100.0 / float(forever.max())
+        return self.reward_scale
 
     def _tensor(self, array: np.ndarray) -> th.Tensor:
         return th.from_numpy(array).to(self.device)
@@ -423,8 +435,9 @@ class OptionReplayBuffer(_OptionStorage):
     and an environment wrapped in :class:`~sb3_ctco.wrappers.OptionExecutionWrapper` they learn on the semi-Markov process.
 
     :param discount_rate: τ, in 1/s; the wrapper's
-    :param reward_scale: what R is multiplied by in samples; ``1/step_weight(dt, discount_rate)`` gives R the unit of a reward
-        of 1 over ``dt``, so that an option of one step is worth to a stock algorithm what a step is
+    :param reward_scale: what R is multiplied by in samples. ``"auto"`` finds it at the first sample after something was paid,
+        and keeps it: the best (or worst) option so far, R/(1 − γ(d)) if it were repeated forever, is worth 100. That does not
+        depend on the unit of rewards, and it is what a reward of 1 a step is worth to SAC with its usual discount of 0.99
     :param demonstration_fraction: part of each batch that is drawn from what ``add_trajectory`` stored, if that is anything
     :param option_space: what options mean, for ``add_trajectory``; CTCO and FiGAR-SAC tell their buffer
     :param primitive_action_space: the action space of the bare environment, likewise
