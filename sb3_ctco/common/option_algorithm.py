@@ -298,6 +298,7 @@ class OptionOffPolicyAlgorithm(OffPolicyAlgorithm):
         env = self._wrap_env(self._as_option_env(env), self.verbose)
         self._check_env(env)
         super().set_env(env, force_reset)
+        self._tell_buffer()
 
     @classmethod
     def load(
@@ -380,7 +381,14 @@ class OptionOffPolicyAlgorithm(OffPolicyAlgorithm):
             settings = self._check_env(self.env)
             self.dt, self.d_min = settings.dt, settings.d_min
         super()._setup_model()
+        self._tell_buffer()
         self._warn_of_a_large_buffer()
+
+    def _tell_buffer(self) -> None:
+        """Tell the replay buffer what options mean, for the trajectories that are added to it."""
+        buffer = self.replay_buffer
+        if isinstance(buffer, OptionReplayBuffer | DictOptionReplayBuffer) and None not in (self.dt, self.d_min):
+            buffer.option_space, buffer.primitive_action_space = self.option_space, self.primitive_action_space
 
     def _warn_of_a_large_buffer(self) -> None:
         buffer, available = self.replay_buffer, _available_memory()
@@ -413,6 +421,7 @@ class OptionOffPolicyAlgorithm(OffPolicyAlgorithm):
                 f"discount_rate={self.discount_rate}: load it into a model with the same gamma and gamma_dt"
             )
         buffer.reward_scale = self.replay_buffer_kwargs["reward_scale"]
+        self._tell_buffer()
 
     def _init_callback(self, callback: MaybeCallback, progress_bar: bool = False) -> BaseCallback:
         if isinstance(callback, list):
