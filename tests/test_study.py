@@ -20,7 +20,7 @@ import yaml
 from conftest import PATIENCE
 from rliable.metrics import aggregate_iqm
 
-from sb3_ctco.common.evaluation import evaluate_discounted_return
+from sb3_ctco.evaluation import evaluate_discounted_return
 from sb3_ctco.registry import ALGORITHMS as ALGORITHM_ROWS
 from sb3_ctco.registry import TASKS, Task, find_task
 from sb3_ctco.study import agents, engines, plots, runs, schedule, status

@@ -1,7 +1,7 @@
 """Replay buffers for options: Stable-Baselines3's, extended by the duration and the integrated reward of a decision."""
 
 import dataclasses
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 import torch as th
@@ -10,15 +10,15 @@ from stable_baselines3.common.buffers import DictReplayBuffer, ReplayBuffer
 from stable_baselines3.common.type_aliases import DictReplayBufferSamples, ReplayBufferSamples
 from stable_baselines3.common.vec_env import VecNormalize
 
-from sb3_ctco.common.vec_env import PENDING
 from sb3_ctco.options import DEFAULT_DISCOUNT_RATE, SubOptions, discount
+from sb3_ctco.vec_env import PENDING
 
 
 class _OptionStorage(ReplayBuffer):
     """What the two option buffers add to their Stable-Baselines3 base."""
 
     #: Of buffers that were saved without one
-    reward_scale = 1.0
+    reward_scale: float | Literal["auto"] = 1.0
 
     def __init__(
         self,
@@ -30,7 +30,7 @@ class _OptionStorage(ReplayBuffer):
         optimize_memory_usage: bool = False,
         handle_timeout_termination: bool = True,
         discount_rate: float = DEFAULT_DISCOUNT_RATE,
-        reward_scale: float = 1.0,
+        reward_scale: float | Literal["auto"] = 1.0,
     ):
         if optimize_memory_usage:
             raise ValueError(
@@ -48,7 +48,7 @@ class _OptionStorage(ReplayBuffer):
             handle_timeout_termination=handle_timeout_termination,
         )
         self.discount_rate = float(discount_rate)
-        self.reward_scale = float(reward_scale)
+        self.reward_scale = reward_scale
         self.durations = np.zeros((self.buffer_size, self.n_envs), dtype=np.float32)
         self.integrated_rewards = np.zeros((self.buffer_size, self.n_envs), dtype=np.float32)
         #: How many decisions were ever added (without sub-options), and how long their options took, in s.
@@ -76,7 +76,7 @@ class _OptionStorage(ReplayBuffer):
 
         :param infos: each with ``info["option"]`` of :class:`~sb3_ctco.wrappers.OptionExecutionWrapper`, and
             ``info["sub_options"]`` if it hands over any; nothing is stored of environments whose option runs on
-            (``info["pending"]`` of :class:`~sb3_ctco.common.vec_env.AsyncOptionVecEnv`)
+            (``info["pending"]`` of :class:`~sb3_ctco.vec_env.AsyncOptionVecEnv`)
         :raises ValueError: if that is missing, not finite, or was discounted at another rate, or if sub-options saw other
             observations than these; nothing is stored then
         """
@@ -162,9 +162,20 @@ class _OptionStorage(ReplayBuffer):
             "actions": self._tensor(rows(self.actions)),
             "next_observations": observations(self.next_observations),
             "dones": self._tensor(dones[:, None]),
-            "rewards": self._tensor(rows(self.integrated_rewards)[:, None]) * self.reward_scale,
+            "rewards": self._tensor(rows(self.integrated_rewards)[:, None]) * self._found_reward_scale(),
             "discounts": self._tensor(discount(rows(self.durations), self.discount_rate)[:, None]),
         }
+
+    def _found_reward_scale(self) -> float:
+        if self.reward_scale != "auto":
+            return self.reward_scale
+        paid = self.integrated_rewards != 0
+        if not paid.any():
+            return 1.0  # Nothing was paid so far, so every scale is the same.
+        # Without a discount, forever is 100 s.
+        forever = np.abs(self.integrated_rewards[paid]) / -np.expm1(-max(self.discount_rate, 0.01) * self.durations[paid])
+        self.reward_scale = 100.0 / float(forever.max())
+        return self.reward_scale
 
     def _tensor(self, array: np.ndarray) -> th.Tensor:
         return th.from_numpy(array).to(self.device)
@@ -224,8 +235,9 @@ class OptionReplayBuffer(_OptionStorage):
     and an environment wrapped in :class:`~sb3_ctco.wrappers.OptionExecutionWrapper` they learn on the semi-Markov process.
 
     :param discount_rate: τ, in 1/s; the wrapper's
-    :param reward_scale: what R is multiplied by in samples; ``1/step_weight(dt, discount_rate)`` gives R the unit of a reward
-        of 1 over ``dt``, so that an option of one step is worth to a stock algorithm what a step is
+    :param reward_scale: what R is multiplied by in samples. ``"auto"`` finds it at the first sample after something was paid,
+        and keeps it: the best (or worst) option so far, R/(1 − γ(d)) if it were repeated forever, is worth 100. That does not
+        depend on the unit of rewards, and it is what a reward of 1 a step is worth to SAC with its usual discount of 0.99
     :raises ValueError: if ``optimize_memory_usage`` is asked for
     """
 

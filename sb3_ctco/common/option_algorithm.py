@@ -43,9 +43,9 @@ from stable_baselines3.common.vec_env import (
 from sb3_ctco.common.buffers import DictOptionReplayBuffer, OptionReplayBuffer
 from sb3_ctco.common.callbacks import OptionProgressBarCallback, PrimitiveStepCallback, eval_callbacks
 from sb3_ctco.common.load_arguments import check_load_arguments
-from sb3_ctco.common.vec_env import PLAYED, AsyncOptionVecEnv
 from sb3_ctco.option_array import OptionArray
-from sb3_ctco.options import DurationScale, OptionSpace, Trajectory, discount_rate_from_gamma, step_weight
+from sb3_ctco.options import DurationScale, OptionSpace, Trajectory, discount_rate_from_gamma
+from sb3_ctco.vec_env import PLAYED, AsyncOptionVecEnv
 from sb3_ctco.wrappers import OptionExecutionWrapper, find_dt
 
 SelfOptionOffPolicyAlgorithm = TypeVar("SelfOptionOffPolicyAlgorithm", bound="OptionOffPolicyAlgorithm")
@@ -67,8 +67,8 @@ class OptionOffPolicyAlgorithm(OffPolicyAlgorithm):
     :param dt: the environment's interaction period, in s; by default found in the environment
     :param trajectory: how ω becomes actions, a name in ``sb3_ctco.options.TRAJECTORIES`` or a class
     :param duration_scale: ``"log"`` or ``"linear"``, see :class:`~sb3_ctco.options.OptionSpace`
-    :param reward_scale: what R is multiplied by for the critics, or ``"gamma_dt"`` for the unit of a reward of 1 over
-        ``gamma_dt``
+    :param reward_scale: what R is multiplied by for the critics, or ``"auto"``, see
+        :class:`~sb3_ctco.common.buffers.OptionReplayBuffer`
     :param gamma: discount factor over ``gamma_dt`` seconds, in (0, 1]
     :param gamma_dt: in s
     :param train_freq: collect at least this many primitive steps (in each environment) between trainings
@@ -112,7 +112,7 @@ class OptionOffPolicyAlgorithm(OffPolicyAlgorithm):
         dt: float | None,
         trajectory: str | type[Trajectory] = "rbf",
         duration_scale: DurationScale = "linear",
-        reward_scale: float | Literal["gamma_dt"] = 1.0,
+        reward_scale: float | Literal["auto"] = 1.0,
         gamma: float,
         gamma_dt: float,
         updates_per_second: float | None,
@@ -127,15 +127,15 @@ class OptionOffPolicyAlgorithm(OffPolicyAlgorithm):
         self.dt = dt
         self.trajectory = trajectory
         self.duration_scale: DurationScale = duration_scale
-        self.reward_scale: float | Literal["gamma_dt"] = reward_scale
+        self.reward_scale: float | Literal["auto"] = reward_scale
         self.gamma = gamma
         self.gamma_dt = gamma_dt
         # An explicit dt stays the user's word on any environment; one that was found must be found again.
         self._dt_was_given = dt is not None
         #: τ, in 1/s
         self.discount_rate = discount_rate_from_gamma(gamma, gamma_dt)
-        if reward_scale != "gamma_dt" and not (isinstance(reward_scale, int | float) and 0 < reward_scale < math.inf):
-            raise ValueError(f"reward_scale must be a positive number or 'gamma_dt', not {reward_scale!r}")
+        if reward_scale != "auto" and not (isinstance(reward_scale, int | float) and 0 < reward_scale < math.inf):
+            raise ValueError(f"reward_scale must be a positive number or 'auto', not {reward_scale!r}")
         if updates_per_second is not None:
             if gradient_steps != -1:
                 raise ValueError(
@@ -371,12 +371,11 @@ class OptionOffPolicyAlgorithm(OffPolicyAlgorithm):
             )
         # Once more, since load may have changed gamma.
         self.discount_rate = discount_rate_from_gamma(self.gamma, self.gamma_dt)
-        scale = 1.0 / step_weight(self.gamma_dt, self.discount_rate) if self.reward_scale == "gamma_dt" else self.reward_scale
-        self.replay_buffer_kwargs = {
-            **self.replay_buffer_kwargs,
-            "discount_rate": self.discount_rate,
-            "reward_scale": scale,
-        }
+        kwargs = {**self.replay_buffer_kwargs, "discount_rate": self.discount_rate}
+        if self.reward_scale != "auto":
+            kwargs["reward_scale"] = self.reward_scale
+        # What "auto" found stays, since critics learned with it.
+        self.replay_buffer_kwargs = {"reward_scale": "auto", **kwargs}
         if self.env is not None:
             settings = self._check_env(self.env)
             self.dt, self.d_min = settings.dt, settings.d_min

@@ -70,8 +70,9 @@ class CTCO(SoftOptionActorCritic):
     :param trajectory: how ω becomes actions: ``"rbf"``, the paper's radial basis functions, ``"bezier"``, or a subclass of
         :class:`~sb3_ctco.options.Trajectory`
     :param duration_scale: ``"linear"``, the paper's, or ``"log"``, see :class:`~sb3_ctco.options.OptionSpace`
-    :param reward_scale: what R is multiplied by for the critics, a number, or ``"gamma_dt"`` for a unit in which a reward of 1
-        over ``gamma_dt`` is worth 1, as a reward is to SAC at that rate. β_h and temperatures are in the unit of what results
+    :param reward_scale: what R is multiplied by for the critics, a number, or ``"auto"`` for a unit that does not depend on
+        that of rewards, in which the best option before learning, if it were repeated forever, is worth 100. β_h and
+        temperatures are in the unit of what results
     :param high_freq_penalty: β_h, subtracted once a decision in the critic's target, or a function of the remaining
         progress
     :param target_decision_rate: in Hz, in place of a fixed β_h: ``high_freq_penalty`` is where β_h starts, and it rises
@@ -137,7 +138,7 @@ class CTCO(SoftOptionActorCritic):
         dt: float | None = None,
         trajectory: str | type[Trajectory] = "rbf",
         duration_scale: DurationScale = "linear",
-        reward_scale: float | Literal["gamma_dt"] = 1.0,
+        reward_scale: float | Literal["auto"] = 1.0,
         high_freq_penalty: float | Schedule = 0.003,
         target_decision_rate: float | None = None,
         ent_coef: str | float = "auto_0.02",

@@ -78,7 +78,7 @@ class _PricedReplayBuffer(OptionReplayBuffer):
 
     def _sample_fields(self, *args: Any) -> dict[str, Any]:
         fields = super()._sample_fields(*args)
-        fields["rewards"] -= self.decision_price * self.reward_scale
+        fields["rewards"] -= self.decision_price * self._found_reward_scale()
         return fields
 
 
