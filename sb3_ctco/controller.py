@@ -13,7 +13,7 @@ import numpy as np
 import numpy.typing as npt
 from gymnasium import spaces
 
-from sb3_ctco.options import ActionBox, OptionSpace
+from sb3_ctco.options import LAST_ACTION, OBSERVATION, ActionBox, OptionSpace, with_last_action
 
 if TYPE_CHECKING:
     from stable_baselines3.common.vec_env import VecNormalize
@@ -27,10 +27,15 @@ METADATA_KEY = "sb3_ctco"
 
 
 class OptionPolicy(Protocol):
-    """What :class:`OptionController` needs of a policy: a function from observations to options, and their meaning."""
+    """What :class:`OptionController` needs of a policy: a function from observations to options, and their meaning.
+
+    With a continuous join, observations hold the action that is being sent, and the space that they are then in is
+    ``observation_space``.
+    """
 
     option_space: OptionSpace
     primitive_action_space: spaces.Box
+    observation_space: spaces.Space
 
     def __call__(self, observation: Observation) -> np.ndarray:
         """Options for one observation, shape ``[option_dim]``, or for several, ``[n, option_dim]``."""
@@ -65,6 +70,7 @@ class ModelPolicy:
             )
         self.option_space = model.option_space
         self.primitive_action_space = model.primitive_action_space
+        self.observation_space = model.observation_space
         self.deterministic = deterministic
         self.vec_normalize = model.get_vec_normalize_env() if vec_normalize is None else vec_normalize
         self.model = model
@@ -110,6 +116,7 @@ class OnnxPolicy:
         try:
             self.option_space, self.primitive_action_space, self._observations = _from_metadata(metadata[METADATA_KEY])
             _check_graph(self._session, self.option_space, self.primitive_action_space, self._observations)
+            self.observation_space = _observation_space(self._observations)
         except (AttributeError, KeyError, TypeError, ValueError, RecursionError) as error:
             raise ValueError(
                 f"the metadata of {path} are not those of an exported policy ({type(error).__name__}: {error}): write it anew "
@@ -165,8 +172,10 @@ _SETTINGS: dict[str, tuple[type, ...]] = {
     "dt": (int, float),
     "discount_rate": (int, float),
     "duration_scale": (str,),
+    "join": (str,),
 }
-_OF_0_1_0 = {"trajectory": "rbf", "duration_scale": "linear"}
+#: Of files that do not say so
+_OF_0_1_0 = {"trajectory": "rbf", "duration_scale": "linear", "join": "free"}
 
 #: Name of a dtype of numbers, as numpy has it, and what ONNX calls it
 _ONNX_TYPES = {
@@ -184,8 +193,9 @@ def _from_metadata(text: str) -> tuple[OptionSpace, spaces.Box, dict[str, tuple[
     :raises ValueError: if a value is out of its range, or malformed; likewise KeyError and TypeError
     """
     data = json.loads(text)
-    # Files that 0.1.0 wrote have it under another name, and no trajectory and scale, which were these.
-    settings = data["option_space"] if "option_space" in data else {**data["option_settings"], **_OF_0_1_0}
+    # Files that 0.1.0 wrote have it under another name.
+    settings = data["option_space"] if "option_space" in data else data["option_settings"]
+    settings = {**_OF_0_1_0, **settings} if isinstance(settings, dict) else settings
     if not isinstance(settings, dict) or settings.keys() != _SETTINGS.keys():
         raise ValueError(f"option_space must have {list(_SETTINGS)}, not {settings}")
     for name, value in settings.items():
@@ -224,12 +234,24 @@ def _check_graph(
         raise ValueError(f"the graph's outputs are {outputs}, and options of these settings have {option_dim} numbers")
 
 
+def _observation_space(observations: dict[str, tuple[tuple[int, ...], str]]) -> spaces.Space:
+    """The space of an exported policy's observations: their shapes and types, whose bounds are all that these allow."""
+    boxes: dict[str, spaces.Space] = {}
+    for name, (shape, kind) in observations.items():
+        dtype: Any = np.dtype(kind)
+        low, high = {"f": (-np.inf, np.inf), "b": (0, 1)}.get(dtype.kind) or (np.iinfo(dtype).min, np.iinfo(dtype).max)
+        boxes[name] = spaces.Box(low, high, shape, dtype)
+    return spaces.Dict(boxes) if LAST_ACTION in boxes else next(iter(boxes.values()))
+
+
 @dataclass(slots=True)
 class _Execution:
     """An option in execution, or none yet (``n_steps`` of 0).
 
     :param plan: its actions, if ticks come at a fixed rate
-    :param weights: ω in the units of the actions, ``[n_rbf, action_dim]``, if they come by a clock
+    :param weights: ω in the units of the actions, ``[n_rbf, action_dim]``, if they come by a clock; with a continuous join the
+        action before is the first
+    :param sent: the action of the last tick
     :param tick: how many of its ticks have passed
     :param start: when it began, by the caller's clock, in s
     """
@@ -238,6 +260,7 @@ class _Execution:
     n_steps: int
     plan: np.ndarray
     weights: np.ndarray
+    sent: np.ndarray
     tick: int = 0
     start: float = 0.0
 
@@ -290,7 +313,9 @@ class OptionController:
         trained = self.policy.option_space
         #: What options mean here: training's settings, at this controller's ``dt``.
         self.settings = trained if dt is None else replace(trained, dt=dt)
+        self._trajectory = self.settings.trajectory
         self._box = ActionBox(self.policy.primitive_action_space.low, self.policy.primitive_action_space.high)
+        self._middle = self._first = self._box.actions(np.zeros((1, self._box.low.size)))[0]
         self._executions: list[_Execution] = []
         self._several = False
         self._now: float | None = None
@@ -300,19 +325,26 @@ class OptionController:
         """Time between two ticks, in s."""
         return self.settings.dt
 
-    def reset(self, which: Sequence[int] | npt.NDArray[Any] | None = None) -> None:
+    def reset(
+        self, which: Sequence[int] | npt.NDArray[Any] | None = None, last_action: npt.NDArray[Any] | None = None
+    ) -> None:
         """Forget the options that run, so that the next tick decides anew: at the start of each episode.
 
         :param which: with several observations, those to reset: their indices or a mask; all of them by default
+        :param last_action: the action that is being sent, from which the first option leaves with a continuous join; by
+            default the middle of the box, as in training
         """
+        first = self._middle if last_action is None else np.asarray(last_action, self._box.low.dtype)
         if which is None:
             self._executions = []
+            self._first = first
             self._now = None
         if not self._executions:
             return
         indices = np.arange(len(self._executions))[np.asarray(which)]
         for i in np.atleast_1d(indices):
             self._executions[i].n_steps = 0
+            self._executions[i].sent = first
 
     def __call__(self, observation: Observation, now: float | None = None) -> np.ndarray:
         """The action to apply from this tick to the next.
@@ -341,7 +373,8 @@ class OptionController:
             executions = self._executions
         actions = []
         for e in executions:
-            actions.append(e.plan[e.tick])
+            e.sent = e.plan[e.tick]
+            actions.append(e.sent)
             e.tick += 1
         return np.stack(actions) if self._several else actions[0]
 
@@ -353,33 +386,58 @@ class OptionController:
         if due or not self._executions:
             self._decide(observation, due, now)
         self._now = now
+        # The action that an option leaves from is that of the tick before it.
+        lead, basis = (dt, self._trajectory.joined_basis) if self.settings.joined else (0.0, self._trajectory.basis)
         # A late tick may find the phase past its end, where the option holds its last action.
-        phases = np.array([min((now - e.start) / (e.n_steps * dt), 1.0) for e in self._executions])
-        features = self.settings.trajectory.basis(phases)
-        actions = self._box.cast(np.array([row.dot(e.weights) for row, e in zip(features, self._executions, strict=True)]))
+        phases = np.array([min((now - e.start + lead) / (e.n_steps * dt), 1.0) for e in self._executions])
+        actions = self._box.cast(
+            np.array([row.dot(e.weights) for row, e in zip(basis(phases), self._executions, strict=True)])
+        )
+        for e, action in zip(self._executions, actions, strict=True):
+            e.sent = action
         return actions if self._several else actions[0]
 
     def _decide(self, observation: Observation, due: list[int], now: float) -> None:
         if not self._executions:
-            options = np.asarray(self.policy(observation))
+            before = self._box.normalised(self._first)
+            if self.settings.joined and self._are_several(observation):
+                before = np.tile(before, (len(_first_leaf(observation)), 1))
+            options = self._ask(observation, before)
             self._several = options.ndim == 2
-            self._executions = [self._begin(option, now) for option in np.atleast_2d(options)]
+            options = np.atleast_2d(options)
+            rows = zip(options, np.broadcast_to(before, (len(options), before.shape[-1])), strict=True)
+            self._executions = [self._begin(option, row, now) for option, row in rows]
             return
         if self._several and len(due) < len(self._executions):
             if isinstance(observation, dict):
                 observation = {key: np.asarray(value)[due] for key, value in observation.items()}
             else:
                 observation = np.asarray(observation)[due]
-        for i, option in zip(due, np.atleast_2d(self.policy(observation)), strict=True):
-            self._executions[i] = self._begin(option, now)
+        before = self._box.normalised(np.array([self._executions[i].sent for i in due]))
+        options = np.atleast_2d(self._ask(observation, before if self._several else before[0]))
+        for i, option, row in zip(due, options, before, strict=True):
+            self._executions[i] = self._begin(option, row, now)
 
-    def _begin(self, option: np.ndarray, now: float) -> _Execution:
+    def _ask(self, observation: Observation, before: np.ndarray) -> np.ndarray:
+        """Options for one or several observations, and the normalised actions that are being sent."""
+        if self.settings.joined:
+            observation = with_last_action(self.policy.observation_space, observation, before)
+        return np.asarray(self.policy(observation))
+
+    def _are_several(self, observation: Observation) -> bool:
+        space: Any = self.policy.observation_space
+        if isinstance(space, spaces.Dict):
+            space = space[next(iter(observation)) if isinstance(observation, dict) else OBSERVATION]
+        return np.ndim(_first_leaf(observation)) > len(space.shape)
+
+    def _begin(self, option: np.ndarray, before: np.ndarray, now: float) -> _Execution:
         # As OptionExecutionWrapper does, in the same precision.
         option = np.clip(option.astype(np.float64), -1.0, 1.0)
         omega, n_steps = self.settings.decode(option)
-        plan = self._box.actions(self.settings.trajectory.plan(omega, n_steps))
+        start, weights = (before, np.vstack([before, omega.T])) if self.settings.joined else (None, omega.T)
+        plan = self._box.actions(self._trajectory.plan(omega, n_steps, start))
         # Features sum to one, so that actions are the same combination of weights in their own units.
-        return _Execution(option, n_steps, plan, self._box.scale(omega.T), start=now)
+        return _Execution(option, n_steps, plan, self._box.scale(weights), sent=plan[0], start=now)
 
     @property
     def option(self) -> np.ndarray:

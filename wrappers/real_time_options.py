@@ -25,7 +25,8 @@ class RealTimeOptionWrapper(OptionExecutionWrapper):
     option before, then the new one without its rest. Its duration and rewards are exactly those of that time, so
     nothing is counted twice or late; but the state at a decision does not tell which rest is still to play. The policy
     sees the state of ``decide_ahead`` seconds before its option begins, and the process is a semi-Markov process only
-    as far as that does not matter. The first option of an episode begins at once.
+    as far as that does not matter. The first option of an episode begins at once. With a continuous join an option leaves from
+    the end of that rest, and the observation holds the action there.
 
     With ``interrupt``, a function that is called after each primitive step, an option ends as soon as it says so; the
     transition has the time that ran.
@@ -59,6 +60,7 @@ class RealTimeOptionWrapper(OptionExecutionWrapper):
         self._ahead_steps = round(decide_ahead / self.option_space.dt)
         self._executor = ThreadPoolExecutor(1, thread_name_prefix="option") if background else None
         self._rest: np.ndarray | None = None
+        self._commands: list[np.ndarray] = []
         self._playing_rest: Future[SequenceResult] | None = None
         self._abandoned = False
         self._decided_on: Any = None
@@ -95,9 +97,10 @@ class RealTimeOptionWrapper(OptionExecutionWrapper):
         """Reset the inner environment."""
         self.abandon()
         self._abandoned = False
-        obs, info = super().reset(seed=seed, options=options)
-        self._decided_on = obs
-        return obs, info
+        result = super().reset(seed=seed, options=options)
+        self._commands = []
+        self._decided_on = self._last_obs
+        return result
 
     def _choose_play(self) -> StepSequence:
         return self._play_around_decisions
@@ -118,6 +121,10 @@ class RealTimeOptionWrapper(OptionExecutionWrapper):
             self._executor.shutdown()
         super().close()
 
+    def _keep_played(self, actions: np.ndarray) -> np.ndarray:
+        last = super()._keep_played(self._played)
+        return last if self._rest is None else self._rest[-1]
+
     def _play_around_decisions(self, plan: np.ndarray) -> SequenceResult:
         rest = self._finish_rest()
         # Something must happen between two decisions.
@@ -131,6 +138,7 @@ class RealTimeOptionWrapper(OptionExecutionWrapper):
                 result = (result[0], [*rest[1], *result[1]], *result[2:])  # type: ignore[misc]
             over = result[2] or result[3] or result[4].get("interrupted", False)
         self._decided_on = result[0]
+        self._played, self._commands = np.array(self._commands), []
         if not over and n_now < len(plan):
             self._rest = plan[n_now:]
             if self._executor is not None:
@@ -149,6 +157,7 @@ class RealTimeOptionWrapper(OptionExecutionWrapper):
         for action in actions:
             if self._abandoned:
                 raise ResetNeeded("playing was abandoned: call reset() first")
+            self._commands.append(action)
             obs, reward, terminated, truncated, info = self.env.step(action)
             rewards.append(reward)
             if terminated or truncated:

@@ -101,6 +101,7 @@ class SubOptions:
 def sub_options(
     space: OptionSpace,
     plan: FloatArray,
+    before: FloatArray | None,
     rewards: FloatArray,
     stretches: list[tuple[int, int]],
     steps: list[int],
@@ -114,6 +115,7 @@ def sub_options(
 
     :param space: what options mean
     :param plan: its normalised actions, ``[n_steps, action_dim]``, of which the first ``len(rewards)`` ran
+    :param before: with a continuous join the normalised action that was being sent when it began, ``[action_dim]``
     :param rewards: of the steps that ran, ``[n_ran]``
     :param stretches: of :func:`draw_stretches`
     :param steps: after how many steps each row of ``seen`` was observed, increasing
@@ -129,7 +131,7 @@ def sub_options(
         ends = np.minimum(ends, n_ran)
         long_enough = ends - firsts >= shortest_steps(space)
         firsts, ends = firsts[long_enough], ends[long_enough]
-    omega, residuals = space.trajectory.fit(plan, firsts, ends)
+    omega, residuals = space.trajectory.fit(plan, firsts, ends, before)
     kept = residuals <= tolerance
     if not kept.all():
         firsts, ends, omega, residuals = firsts[kept], ends[kept], omega[kept], residuals[kept]
