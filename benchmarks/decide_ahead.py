@@ -16,7 +16,7 @@ import numpy as np
 import torch as th
 
 from sb3_ctco import CTCO
-from sb3_ctco.common.evaluation import DiscountedReturnCallback, evaluate_discounted_return
+from sb3_ctco.evaluation import DiscountedReturnCallback, evaluate_discounted_return
 from sb3_ctco.wrappers import RealTimeOptionWrapper
 
 ENV = "sb3_ctco/ball_in_cup-catch-50hz-v0"

@@ -16,7 +16,7 @@ import torch as th
 from gymnasium import spaces
 
 from sb3_ctco import CTCO
-from sb3_ctco.common.evaluation import evaluate_discounted_return
+from sb3_ctco.evaluation import evaluate_discounted_return
 from sb3_ctco.wrappers import RealTimeOptionWrapper
 
 SPEEDS = (0.0, 0.1, 0.2, 0.4, 0.8)

@@ -23,7 +23,7 @@ import numpy as np
 import torch as th
 
 from sb3_ctco import CTCO
-from sb3_ctco.common.evaluation import largest_jump, mean_absolute_jerk
+from sb3_ctco.evaluation import largest_jump, mean_absolute_jerk
 from sb3_ctco.options import discount
 from sb3_ctco.study.agents import make_eval_env
 from sb3_ctco.study.grid import Run

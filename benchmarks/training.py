@@ -17,7 +17,7 @@ import torch as th
 from stable_baselines3.common.base_class import BaseAlgorithm
 
 from sb3_ctco import CTCO
-from sb3_ctco.common.sac_at_rate import sac_at_rate
+from sb3_ctco.fixed_rate import sac_at_rate
 
 COMMON: dict[str, Any] = {
     "learning_rate": 1e-3,

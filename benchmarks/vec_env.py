@@ -20,7 +20,7 @@ import torch as th
 from stable_baselines3.common.vec_env import SubprocVecEnv
 
 from sb3_ctco import CTCO, OptionExecutionWrapper
-from sb3_ctco.common.vec_env import AsyncOptionVecEnv
+from sb3_ctco.vec_env import AsyncOptionVecEnv
 
 N_ENVS = 8
 

@@ -22,7 +22,7 @@ from stable_baselines3 import SAC
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 
 from sb3_ctco import CTCO
-from sb3_ctco.common.evaluation import DiscountedReturnCallback, EpisodeStatistics, evaluate_discounted_return
+from sb3_ctco.evaluation import DiscountedReturnCallback, EpisodeStatistics, evaluate_discounted_return
 from sb3_ctco.options import discount_rate_from_gamma
 from sb3_ctco.wrappers import find_dt
 

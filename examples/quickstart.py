@@ -17,7 +17,7 @@ import numpy as np
 import torch as th
 
 from sb3_ctco import CTCO, OptionExecutionWrapper
-from sb3_ctco.common.evaluation import DiscountedReturnCallback, EpisodeStatistics, evaluate_discounted_return
+from sb3_ctco.evaluation import DiscountedReturnCallback, EpisodeStatistics, evaluate_discounted_return
 from sb3_ctco.options import step_weight
 
 mpl.use("Agg")

@@ -28,10 +28,10 @@ from stable_baselines3.common.callbacks import BaseCallback, CallbackList
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 
 from sb3_ctco import CTCO
-from sb3_ctco.common.evaluation import DiscountedReturnCallback, evaluate_discounted_return
-from sb3_ctco.common.spatial_softmax import SpatialSoftmaxExtractor
+from sb3_ctco.evaluation import DiscountedReturnCallback, evaluate_discounted_return
 from sb3_ctco.options import DEFAULT_DISCOUNT_RATE
 from sb3_ctco.realtime import AsynchronousTrainer
+from sb3_ctco.torch_layers import SpatialSoftmaxExtractor
 
 COMMON: dict[str, Any] = {
     "learning_rate": 1e-3,

@@ -14,11 +14,11 @@ from sb3_ctco.envs import register_envs
 
 if TYPE_CHECKING:
     from sb3_ctco.common.buffers import DictOptionReplayBuffer, OptionReplayBuffer
-    from sb3_ctco.common.sac_at_rate import sac_at_rate
     from sb3_ctco.controller import OptionController
     from sb3_ctco.ctco import CTCO
     from sb3_ctco.dac_ppo import DACPPO
     from sb3_ctco.figar_sac import FiGARSAC
+    from sb3_ctco.fixed_rate import sac_at_rate
     from sb3_ctco.wrappers import OptionExecutionWrapper, RewardRateWrapper
 
 __all__ = [
@@ -44,7 +44,7 @@ _HOMES = {
     "OptionExecutionWrapper": "sb3_ctco.wrappers",
     "OptionReplayBuffer": "sb3_ctco.common.buffers",
     "RewardRateWrapper": "sb3_ctco.wrappers",
-    "sac_at_rate": "sb3_ctco.common.sac_at_rate",
+    "sac_at_rate": "sb3_ctco.fixed_rate",
 }
 
 

@@ -17,10 +17,10 @@ from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv, VecNormalize, sync_envs_normalization
 
 from sb3_ctco.common.option_algorithm import OptionOffPolicyAlgorithm
-from sb3_ctco.common.sac_at_rate import sac_at_rate
 from sb3_ctco.ctco import CTCO
 from sb3_ctco.dac_ppo import DACPPO
 from sb3_ctco.figar_sac import FiGARSAC
+from sb3_ctco.fixed_rate import sac_at_rate
 from sb3_ctco.options import discount_rate_from_gamma
 from sb3_ctco.wrappers import RewardRateWrapper, find_dt
 

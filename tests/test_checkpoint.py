@@ -12,7 +12,7 @@ from stable_baselines3.common.noise import OrnsteinUhlenbeckActionNoise
 from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecNormalize
 
 from sb3_ctco import CTCO, DACPPO, FiGARSAC, OptionExecutionWrapper, OptionReplayBuffer
-from sb3_ctco.common.checkpoint import load_checkpoint, save_checkpoint
+from sb3_ctco.checkpoint import load_checkpoint, save_checkpoint
 
 OFF_POLICY = {"learning_starts": 60, "batch_size": 8, "buffer_size": 500, "policy_kwargs": {"net_arch": [8]}, "seed": 3}
 LEARNERS = {

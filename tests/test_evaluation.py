@@ -11,7 +11,7 @@ from stable_baselines3.common.vec_env import DummyVecEnv
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
 from sb3_ctco import CTCO, OptionExecutionWrapper, RewardRateWrapper
-from sb3_ctco.common.evaluation import (
+from sb3_ctco.evaluation import (
     DiscountedReturnCallback,
     evaluate_discounted_return,
     mean_absolute_jerk,

@@ -18,10 +18,9 @@ from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 
 from sb3_ctco import CTCO, FiGARSAC, OptionController, OptionExecutionWrapper
-from sb3_ctco.common.checkpoint import load_checkpoint, save_checkpoint
-from sb3_ctco.common.evaluation import evaluate_discounted_return, largest_jump, mean_absolute_jerk
-from sb3_ctco.common.vec_env import AsyncOptionVecEnv
+from sb3_ctco.checkpoint import load_checkpoint, save_checkpoint
 from sb3_ctco.controller import METADATA_KEY, OnnxPolicy
+from sb3_ctco.evaluation import evaluate_discounted_return, largest_jump, mean_absolute_jerk
 from sb3_ctco.export import export_onnx
 from sb3_ctco.options import (
     LAST_ACTION,
@@ -32,6 +31,7 @@ from sb3_ctco.options import (
     RadialBasis,
     with_last_action_space,
 )
+from sb3_ctco.vec_env import AsyncOptionVecEnv
 from sb3_ctco.wrappers import RealTimeOptionWrapper
 
 KINDS = TRAJECTORIES.values()

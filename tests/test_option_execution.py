@@ -14,7 +14,7 @@ from stable_baselines3.common.evaluation import evaluate_policy
 from stable_baselines3.common.monitor import Monitor
 
 from sb3_ctco import CTCO
-from sb3_ctco.common.sac_at_rate import sac_at_rate
+from sb3_ctco.fixed_rate import sac_at_rate
 from sb3_ctco.options import RadialBasis
 from sb3_ctco.wrappers import OptionExecutionWrapper, SupportsStepSequence, find_dt
 

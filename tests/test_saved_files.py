@@ -1,13 +1,17 @@
 """Models and replay buffers that version 0.1.0 saved, in tests/data: they act as they did, and learn on."""
 
+import base64
+import json
 from pathlib import Path
 
 import gymnasium as gym
 import numpy as np
 import pytest
+from stable_baselines3.common.save_util import data_to_json, json_to_data
 
 from sb3_ctco import CTCO, FiGARSAC
 from sb3_ctco.option_array import plain
+from sb3_ctco.torch_layers import SpatialSoftmaxExtractor
 
 DATA = Path(__file__).parent / "data"
 OBSERVATIONS = np.array([[1.0, 0.0, 0.0], [0.0, 1.0, 1.0]], dtype=np.float32)
@@ -40,3 +44,11 @@ def test_a_replay_buffer_of_0_1_0_is_learned_from():
     model.learn(60, reset_num_timesteps=False)
     samples = model.replay_buffer.sample(8)
     assert samples.rewards.shape == samples.discounts.shape == (8, 1)
+
+
+def test_the_features_extractor_is_found_where_0_1_0_had_it(monkeypatch):
+    with monkeypatch.context() as patch:
+        patch.setattr(SpatialSoftmaxExtractor, "__module__", "sb3_ctco.common.spatial_softmax")
+        saved = data_to_json({"policy_kwargs": {"features_extractor_class": SpatialSoftmaxExtractor}})
+    assert b"sb3_ctco.common.spatial_softmax" in base64.b64decode(json.loads(saved)["policy_kwargs"][":serialized:"])
+    assert json_to_data(saved)["policy_kwargs"]["features_extractor_class"] is SpatialSoftmaxExtractor

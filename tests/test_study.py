@@ -76,7 +76,7 @@ def wait_for(condition) -> None:
 
 
 def test_the_presets_are_the_grids_that_they_should_be():
-    assert preset_names() == ["learning", "native", "paper", "quick", "smoke"]
+    assert preset_names() == ["learning", "native", "paper", "quick", "smoke", "unseen"]
     paper, quick = load_preset("paper"), load_preset("quick")
     assert len(paper.select(settings=["paper"])) == 30 * 4 * 3 * 4
     assert {run.task_seconds for run in paper.runs} == {400 * 60}
@@ -110,7 +110,7 @@ def test_seeds_may_be_others_than_the_presets() -> None:
         quick.select(seeds=[-1])
 
 
-@pytest.mark.parametrize("name", ["smoke", "quick", "paper"])
+@pytest.mark.parametrize("name", ["smoke", "quick", "paper", "unseen"])
 def test_every_setting_fits_its_constructor_and_environment(name):
     for run in load_preset(name).runs:
         agents.constructor_arguments(run)

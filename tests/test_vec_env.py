@@ -9,9 +9,9 @@ from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.vec_env import SubprocVecEnv, VecNormalize
 
 from sb3_ctco import CTCO, FiGARSAC, OptionExecutionWrapper
-from sb3_ctco.common.evaluation import DiscountedReturnCallback, evaluate_discounted_return
-from sb3_ctco.common.vec_env import AsyncOptionVecEnv
+from sb3_ctco.evaluation import DiscountedReturnCallback, evaluate_discounted_return
 from sb3_ctco.figar_sac.policies import decode_repetitions
+from sb3_ctco.vec_env import AsyncOptionVecEnv
 
 WRAPPER = {"n_rbf": 2, "d_max": 1.0}
 

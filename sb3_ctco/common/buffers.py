@@ -10,8 +10,8 @@ from stable_baselines3.common.buffers import DictReplayBuffer, ReplayBuffer
 from stable_baselines3.common.type_aliases import DictReplayBufferSamples, ReplayBufferSamples
 from stable_baselines3.common.vec_env import VecNormalize
 
-from sb3_ctco.common.vec_env import PENDING
 from sb3_ctco.options import DEFAULT_DISCOUNT_RATE, SubOptions, discount
+from sb3_ctco.vec_env import PENDING
 
 
 class _OptionStorage(ReplayBuffer):
@@ -76,7 +76,7 @@ class _OptionStorage(ReplayBuffer):
 
         :param infos: each with ``info["option"]`` of :class:`~sb3_ctco.wrappers.OptionExecutionWrapper`, and
             ``info["sub_options"]`` if it hands over any; nothing is stored of environments whose option runs on
-            (``info["pending"]`` of :class:`~sb3_ctco.common.vec_env.AsyncOptionVecEnv`)
+            (``info["pending"]`` of :class:`~sb3_ctco.vec_env.AsyncOptionVecEnv`)
         :raises ValueError: if that is missing, not finite, or was discounted at another rate, or if sub-options saw other
             observations than these; nothing is stored then
         """

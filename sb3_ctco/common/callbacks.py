@@ -14,7 +14,7 @@ from stable_baselines3.common.callbacks import (
     ProgressBarCallback,
 )
 
-from sb3_ctco.common.vec_env import PENDING
+from sb3_ctco.vec_env import PENDING
 
 
 def eval_callbacks(callback: BaseCallback | None) -> Iterator[EvalCallback]:
@@ -36,7 +36,7 @@ class PrimitiveStepCallback(BaseCallback):
 
     With several environments one tick stands for a primitive step in each of them, as in Stable-Baselines3; options
     of different lengths are averaged, and the remainder is carried over; what options brought that end one by one
-    (:class:`~sb3_ctco.common.vec_env.AsyncOptionVecEnv`) is shown together, at the next tick.
+    (:class:`~sb3_ctco.vec_env.AsyncOptionVecEnv`) is shown together, at the next tick.
 
     :param callback: the user's callback; None if there is none
     """

@@ -43,9 +43,9 @@ from stable_baselines3.common.vec_env import (
 from sb3_ctco.common.buffers import DictOptionReplayBuffer, OptionReplayBuffer
 from sb3_ctco.common.callbacks import OptionProgressBarCallback, PrimitiveStepCallback, eval_callbacks
 from sb3_ctco.common.load_arguments import check_load_arguments
-from sb3_ctco.common.vec_env import PLAYED, AsyncOptionVecEnv
 from sb3_ctco.option_array import OptionArray
 from sb3_ctco.options import DurationScale, Join, OptionSpace, Trajectory, discount_rate_from_gamma, step_weight
+from sb3_ctco.vec_env import PLAYED, AsyncOptionVecEnv
 from sb3_ctco.wrappers import OptionExecutionWrapper, find_dt
 
 SelfOptionOffPolicyAlgorithm = TypeVar("SelfOptionOffPolicyAlgorithm", bound="OptionOffPolicyAlgorithm")

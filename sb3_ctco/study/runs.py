@@ -21,7 +21,7 @@ import torch as th
 from stable_baselines3.common.base_class import BaseAlgorithm
 
 import sb3_ctco
-from sb3_ctco.common.evaluation import DiscountedReturnCallback, EpisodeStatistics, evaluate_discounted_return
+from sb3_ctco.evaluation import DiscountedReturnCallback, EpisodeStatistics, evaluate_discounted_return
 from sb3_ctco.study.agents import discount_rate, make_eval_env, make_model
 from sb3_ctco.study.grid import Run
 

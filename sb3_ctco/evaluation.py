@@ -12,8 +12,8 @@ from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.type_aliases import PolicyPredictor
 from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv
 
-from sb3_ctco.common.vec_env import PENDING
 from sb3_ctco.options import DEFAULT_DISCOUNT_RATE, discount, step_weight
+from sb3_ctco.vec_env import PENDING
 
 
 def mean_absolute_jerk(actions: npt.ArrayLike, dt: float) -> float:

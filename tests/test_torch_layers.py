@@ -9,7 +9,7 @@ from stable_baselines3 import SAC
 from stable_baselines3.common.preprocessing import preprocess_obs
 
 from sb3_ctco import CTCO
-from sb3_ctco.common.spatial_softmax import SpatialSoftmax, SpatialSoftmaxExtractor, random_shift
+from sb3_ctco.torch_layers import SpatialSoftmax, SpatialSoftmaxExtractor, random_shift
 
 HEIGHT, WIDTH = 60, 80
 FIRST = spaces.Box(0, 255, (3, HEIGHT, WIDTH), np.uint8)

@@ -11,9 +11,9 @@ from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.monitor import Monitor
 
 from sb3_ctco import OptionExecutionWrapper, RewardRateWrapper, sac_at_rate
-from sb3_ctco.common import sac_at_rate as module
-from sb3_ctco.common.evaluation import DiscountedReturnCallback, evaluate_discounted_return
-from sb3_ctco.common.sac_at_rate import update_schedule
+from sb3_ctco import fixed_rate as module
+from sb3_ctco.evaluation import DiscountedReturnCallback, evaluate_discounted_return
+from sb3_ctco.fixed_rate import update_schedule
 from sb3_ctco.options import DEFAULT_DISCOUNT_RATE
 from sb3_ctco.wrappers import reward_rate
 
