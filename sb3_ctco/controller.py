@@ -399,29 +399,27 @@ class OptionController:
 
     def _decide(self, observation: Observation, due: list[int], now: float) -> None:
         if not self._executions:
-            before = self._box.normalised(self._first)
-            if self.settings.joined and self._are_several(observation):
-                before = np.tile(before, (len(_first_leaf(observation)), 1))
-            options = self._ask(observation, before)
+            several = self.settings.joined and self._are_several(observation)
+            sent = [self._first] * (len(_first_leaf(observation)) if several else 1)
+            options = self._ask(observation, sent, several)
             self._several = options.ndim == 2
-            options = np.atleast_2d(options)
-            rows = zip(options, np.broadcast_to(before, (len(options), before.shape[-1])), strict=True)
-            self._executions = [self._begin(option, row, now) for option, row in rows]
+            self._executions = [self._begin(option, self._first, now) for option in np.atleast_2d(options)]
             return
         if self._several and len(due) < len(self._executions):
             if isinstance(observation, dict):
                 observation = {key: np.asarray(value)[due] for key, value in observation.items()}
             else:
                 observation = np.asarray(observation)[due]
-        before = self._box.normalised(np.array([self._executions[i].sent for i in due]))
-        options = np.atleast_2d(self._ask(observation, before if self._several else before[0]))
-        for i, option, row in zip(due, options, before, strict=True):
-            self._executions[i] = self._begin(option, row, now)
+        sent = [self._executions[i].sent for i in due]
+        options = np.atleast_2d(self._ask(observation, sent, self._several))
+        for i, option, action in zip(due, options, sent, strict=True):
+            self._executions[i] = self._begin(option, action, now)
 
-    def _ask(self, observation: Observation, before: np.ndarray) -> np.ndarray:
-        """Options for one or several observations, and the normalised actions that are being sent."""
+    def _ask(self, observation: Observation, sent: list[np.ndarray], several: bool) -> np.ndarray:
+        """Options for one or several observations, and the actions that are being sent."""
         if self.settings.joined:
-            observation = with_last_action(self.policy.observation_space, observation, before)
+            before = self._box.normalise(sent)
+            observation = with_last_action(self.policy.observation_space, observation, before if several else before[0])
         return np.asarray(self.policy(observation))
 
     def _are_several(self, observation: Observation) -> bool:
@@ -430,14 +428,15 @@ class OptionController:
             space = space[next(iter(observation)) if isinstance(observation, dict) else OBSERVATION]
         return np.ndim(_first_leaf(observation)) > len(space.shape)
 
-    def _begin(self, option: np.ndarray, before: np.ndarray, now: float) -> _Execution:
+    def _begin(self, option: np.ndarray, sent: np.ndarray, now: float) -> _Execution:
         # As OptionExecutionWrapper does, in the same precision.
         option = np.clip(option.astype(np.float64), -1.0, 1.0)
         omega, n_steps = self.settings.decode(option)
-        start, weights = (before, np.vstack([before, omega.T])) if self.settings.joined else (None, omega.T)
+        start = self._box.normalise([sent])[0] if self.settings.joined else None
         plan = self._box.actions(self._trajectory.plan(omega, n_steps, start))
         # Features sum to one, so that actions are the same combination of weights in their own units.
-        return _Execution(option, n_steps, plan, self._box.scale(weights), sent=plan[0], start=now)
+        weights = self._box.scale(omega.T if start is None else np.vstack([start, omega.T]))
+        return _Execution(option, n_steps, plan, weights, sent=plan[0], start=now)
 
     @property
     def option(self) -> np.ndarray:

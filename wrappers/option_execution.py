@@ -186,7 +186,7 @@ class OptionExecutionWrapper(gym.Wrapper, RecordConstructorArgs):
         obs, info = result
         self._last_action = np.zeros(self._box.low.size)
         if LAST_ACTION in info:
-            self._last_action = self._box.normalised(np.reshape(info[LAST_ACTION], self._box.low.shape))
+            self._last_action = self._box.normalise([info[LAST_ACTION]])[0].clip(-1.0, 1.0)
         return with_last_action(self.observation_space, obs, self._last_action), info
 
     def _choose_play(self) -> StepSequence:
@@ -240,7 +240,7 @@ class OptionExecutionWrapper(gym.Wrapper, RecordConstructorArgs):
         n_ran = len(rewards)
         last_action = self._keep_played(actions[:n_ran])
         if before is not None:
-            self._last_action = self._box.normalised(last_action)
+            self._last_action = self._box.normalise([last_action])[0]
             obs = with_last_action(self.observation_space, obs, self._last_action)
         integral = integrated_reward(rewards, space.dt, space.discount_rate, self.reward_unit)
         info["option"] = OptionInfo(
@@ -253,10 +253,10 @@ class OptionExecutionWrapper(gym.Wrapper, RecordConstructorArgs):
             steps = [0, *observe[: len(observations)], n_ran]
             self._last_obs = rows_of(seen, -1)
             if before is not None:
-                last_actions = np.vstack([before, self._box.normalised(actions[np.array(steps[1:]) - 1])])
+                last_actions = np.vstack([before, self._box.normalise(actions[np.array(steps[1:]) - 1])])
                 seen = with_last_action(self.observation_space, seen, last_actions)
-            played, ended = (trajectory, before, rewards, stretches, steps, seen), (terminated, truncated)
-            info["sub_options"] = sub_options(space, *played, *ended, self.reward_unit, self.sub_option_tolerance)
+            played, ended = (trajectory, rewards, stretches, steps, seen), (terminated, truncated)
+            info["sub_options"] = sub_options(space, *played, *ended, self.reward_unit, self.sub_option_tolerance, before)
         return obs, float(rewards.sum()) if self.reward == "sum" else integral, terminated, truncated, info
 
     def set_n_sub_options(self, n_sub_options: int) -> None:

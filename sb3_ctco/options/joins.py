@@ -45,6 +45,7 @@ def with_last_action(space: spaces.Space, observation: Any, action: FloatArray) 
     :param observation: the environment's, ``[*shape]`` or ``[n, *shape]``, or a dictionary of such
     :param action: normalised, ``[action_dim]`` or ``[n, action_dim]``
     """
+    action = action.clip(-1.0, 1.0)  # rounding
     if isinstance(space, spaces.Box):
         return np.concatenate([observation, action.astype(space.dtype)], axis=-1)
     parts = observation if isinstance(observation, dict) else {OBSERVATION: observation}

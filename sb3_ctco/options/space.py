@@ -182,17 +182,19 @@ class ActionBox:
         """Normalised actions in the units of the box, in double precision: shape ``[n_steps, action_dim]``, as given."""
         return (trajectory + 1.0) * self._half_width + self._bottom
 
+    def normalise(self, actions: npt.ArrayLike) -> FloatArray:
+        """The inverse of :meth:`scale`, for actions ``[n_steps, *action_shape]``: shape ``[n_steps, action_dim]``.
+
+        :raises ValueError: if they have another shape
+        """
+        given = np.asarray(actions, dtype=np.float64)
+        if given.ndim == 0 or given.shape[1:] != self.low.shape:
+            raise ValueError(f"actions must have shape [n, *{self.low.shape}], not {given.shape}")
+        # Where both bounds are the same, there is nothing to say, which is 0.
+        width = np.where(self._half_width > 0, self._half_width, 1.0)
+        return (given.reshape(len(given), -1) - self._bottom - self._half_width) / width
+
     def cast(self, actions: FloatArray) -> npt.NDArray[Any]:
         """Actions in the units of the box, in its shape and precision: ``[n_steps, *action_shape]``."""
         # The cast may round past a bound.
         return actions.astype(self.low.dtype).reshape(-1, *self.low.shape).clip(self.low, self.high)
-
-    def normalised(self, actions: npt.NDArray[Any]) -> FloatArray:
-        """Actions in the units of the box as numbers in [−1, 1], 0 where the box has no width: the inverse of :meth:`actions`.
-
-        :param actions: shape ``[*action_shape]``, or ``[n, *action_shape]``
-        :return: shape ``[action_dim]``, or ``[n, action_dim]``
-        """
-        flat = actions.astype(np.float64).reshape(*actions.shape[: actions.ndim - self.low.ndim], -1)
-        width = np.where(self._half_width > 0.0, self._half_width, np.inf)
-        return ((flat - self._bottom) / width - (width < np.inf)).clip(-1.0, 1.0)

@@ -101,7 +101,6 @@ class SubOptions:
 def sub_options(
     space: OptionSpace,
     plan: FloatArray,
-    before: FloatArray | None,
     rewards: FloatArray,
     stretches: list[tuple[int, int]],
     steps: list[int],
@@ -110,12 +109,12 @@ def sub_options(
     truncated: bool,
     reward_unit: RewardUnit = "rate",
     tolerance: float = 0.1,
+    before: FloatArray | None = None,
 ) -> SubOptions:
     """Transitions of stretches of an option; at the episode's end they end with it, or are dropped.
 
     :param space: what options mean
     :param plan: its normalised actions, ``[n_steps, action_dim]``, of which the first ``len(rewards)`` ran
-    :param before: with a continuous join the normalised action that was being sent when it began, ``[action_dim]``
     :param rewards: of the steps that ran, ``[n_ran]``
     :param stretches: of :func:`draw_stretches`
     :param steps: after how many steps each row of ``seen`` was observed, increasing
@@ -124,6 +123,7 @@ def sub_options(
     :param truncated: whether it was truncated with it
     :param reward_unit: ``"rate"`` or ``"impulse"``, see :func:`~sb3_ctco.options.integrated_reward`
     :param tolerance: largest deviation that a stretch's fitted actions may have, normalised
+    :param before: with a continuous join the normalised action that was being sent when the option began, ``[action_dim]``
     """
     n_ran = len(rewards)
     firsts, ends = np.array(stretches, dtype=np.int64).reshape(-1, 2).T
