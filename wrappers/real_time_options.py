@@ -2,13 +2,15 @@
 
 from collections.abc import Callable
 from concurrent.futures import Future, ThreadPoolExecutor
-from typing import Any
+from typing import Any, SupportsFloat
 
 import gymnasium as gym
 import numpy as np
+import numpy.typing as npt
 from gymnasium.error import ResetNeeded
 from gymnasium.utils import RecordConstructorArgs
 
+from sb3_ctco.options import PLAYED, ValueInterrupt, shortest_steps, stack, with_last_action
 from sb3_ctco.wrappers.option_execution import OptionExecutionWrapper
 from sb3_ctco.wrappers.step_sequence import SequenceResult, StepSequence
 
@@ -28,23 +30,27 @@ class RealTimeOptionWrapper(OptionExecutionWrapper):
     as far as that does not matter. The first option of an episode begins at once. With a continuous join an option leaves from
     the end of that rest, and the observation holds the action there.
 
-    With ``interrupt``, a function that is called after each primitive step, an option ends as soon as it says so; the
-    transition has the time that ran.
+    With ``interrupt``, a function that is called after each primitive step, an option ends as soon as it says so; or as soon
+    as a :class:`~sb3_ctco.options.ValueInterrupt` does, which is asked every ``check_period`` and told the rest of the plan.
+    The transition has the time that ran, and ``info["played"]`` is the option that plays what was played, as which CTCO stores
+    it (not with ``decide_ahead``, where a transition consists of parts of two options).
 
     :param env: the environment to wrap
     :param decide_ahead: in s; rounded to whole steps
-    :param interrupt: called as ``interrupt(observation of the last decision, observation, seconds since that one)``
+    :param interrupt: called as ``interrupt(observation of the last decision, observation, seconds since that one)``; or a
+        :class:`~sb3_ctco.options.ValueInterrupt`
     :param background: whether the rest of an option plays in a thread of its own, which is for environments that the
         wall clock governs and that may be stepped from another thread (one that renders may not)
     :param kwargs: see :class:`OptionExecutionWrapper`
-    :raises ValueError: if ``decide_ahead`` is negative or not shorter than the longest option, or for sub-options
+    :raises ValueError: if ``decide_ahead`` is negative or not shorter than the longest option, for sub-options, or for a
+        ValueInterrupt with ``decide_ahead``
     """
 
     def __init__(
         self,
         env: gym.Env,
         decide_ahead: float = 0.0,
-        interrupt: Interrupt | None = None,
+        interrupt: Interrupt | ValueInterrupt | None = None,
         background: bool = False,
         **kwargs: Any,
     ):
@@ -56,7 +62,6 @@ class RealTimeOptionWrapper(OptionExecutionWrapper):
             raise ValueError(
                 f"decide_ahead must be at least 0 s and less than d_max={self.option_space.d_max} s, not {decide_ahead}"
             )
-        self.interrupt = interrupt
         self._ahead_steps = round(decide_ahead / self.option_space.dt)
         self._executor = ThreadPoolExecutor(1, thread_name_prefix="option") if background else None
         self._rest: np.ndarray | None = None
@@ -65,6 +70,25 @@ class RealTimeOptionWrapper(OptionExecutionWrapper):
         self._abandoned = False
         self._decided_on: Any = None
         self._play: StepSequence | None = None
+        self.interrupt = interrupt
+
+    @property
+    def interrupt(self) -> Interrupt | ValueInterrupt | None:
+        """What ends an option early; may be set between two steps."""
+        return self._interrupt
+
+    @interrupt.setter
+    def interrupt(self, interrupt: Interrupt | ValueInterrupt | None) -> None:
+        self._interrupt = interrupt
+        #: What a ValueInterrupt's period is in steps
+        self._check_steps: int | None = None
+        if isinstance(interrupt, ValueInterrupt):
+            if self._ahead_steps:
+                raise ValueError(
+                    "a ValueInterrupt compares the rest of an option with the next one, which is decided on already with "
+                    "decide_ahead: pass decide_ahead=0, or a rule about observations"
+                )
+            self._check_steps = max(1, round(interrupt.check_period / self.option_space.dt))
 
     def set_n_sub_options(self, n_sub_options: int) -> None:
         """Sub-options are not possible in real time.
@@ -80,7 +104,11 @@ class RealTimeOptionWrapper(OptionExecutionWrapper):
 
     @classmethod
     def like(
-        cls, wrapper: OptionExecutionWrapper, decide_ahead: float, interrupt: Interrupt | None, background: bool
+        cls,
+        wrapper: OptionExecutionWrapper,
+        decide_ahead: float,
+        interrupt: Interrupt | ValueInterrupt | None,
+        background: bool,
     ) -> "RealTimeOptionWrapper":
         """The same wrapper around the same environment, with what this class adds, and without sub-options."""
         return cls(
@@ -100,6 +128,18 @@ class RealTimeOptionWrapper(OptionExecutionWrapper):
         result = super().reset(seed=seed, options=options)
         self._commands = []
         self._decided_on = self._last_obs
+        return result
+
+    def step(self, action: npt.ArrayLike) -> tuple[Any, SupportsFloat, bool, bool, dict[str, Any]]:
+        """Play one option, or what is due of it and of the one before."""
+        before = self._last_action
+        result = super().step(action)
+        info = result[4]
+        if info.get("interrupted", False) and not self._ahead_steps:
+            played = self._box.normalise(self.played)
+            option, residual = self.option_space.stretch(played, 0, len(played), before)
+            if residual <= self.sub_option_tolerance:
+                info[PLAYED] = option
         return result
 
     def _choose_play(self) -> StepSequence:
@@ -162,9 +202,20 @@ class RealTimeOptionWrapper(OptionExecutionWrapper):
             rewards.append(reward)
             if terminated or truncated:
                 break
-            if self.interrupt is not None and self.interrupt(
-                self._decided_on, obs, (steps_before + len(rewards)) * self.option_space.dt
-            ):
+            if self._interrupt is not None and self._is_interrupted(obs, actions, len(rewards), steps_before):
                 info = {**info, "interrupted": True}
                 break
         return obs, rewards, terminated, truncated, info
+
+    def _is_interrupted(self, obs: Any, actions: np.ndarray, n_ran: int, steps_before: int) -> bool:
+        if self._check_steps is None:
+            assert callable(self._interrupt)
+            return self._interrupt(self._decided_on, obs, (steps_before + n_ran) * self.option_space.dt)
+        if n_ran % self._check_steps or len(actions) - n_ran < shortest_steps(self.option_space):
+            return False
+        assert isinstance(self._interrupt, ValueInterrupt)
+        plan = self._box.normalise(actions)
+        rest, _ = self.option_space.stretch(plan, n_ran, len(plan), self._last_action)
+        if self.option_space.joined:
+            obs = with_last_action(self.observation_space, obs, plan[n_ran - 1])
+        return bool(self._interrupt.worth_ending(stack([obs]), rest[None])[0])

@@ -16,9 +16,11 @@ R              ``integrated_reward``                        reward rate × s
 ============== ============================================ ========================
 """
 
+from sb3_ctco.options.interrupts import ValueInterrupt
 from sb3_ctco.options.joins import LAST_ACTION, OBSERVATION, with_last_action, with_last_action_space
 from sb3_ctco.options.semi_mdp import (
     DEFAULT_DISCOUNT_RATE,
+    PLAYED,
     REWARD_UNITS,
     FloatArray,
     OptionInfo,
@@ -40,6 +42,7 @@ __all__ = [
     "JOINS",
     "LAST_ACTION",
     "OBSERVATION",
+    "PLAYED",
     "REWARD_UNITS",
     "TRAJECTORIES",
     "ActionBox",
@@ -54,6 +57,7 @@ __all__ = [
     "Stacked",
     "SubOptions",
     "Trajectory",
+    "ValueInterrupt",
     "basis_of_steps",
     "discount",
     "discount_rate_from_gamma",
