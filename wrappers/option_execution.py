@@ -55,8 +55,8 @@ class OptionExecutionWrapper(gym.Wrapper, RecordConstructorArgs):
 
     The order of wrappers is ``OptionExecutionWrapper(Monitor(TimeLimit(env)))``: what is inside sees primitive steps.
     If the inner environment offers ``step_sequence`` (:class:`SupportsStepSequence`), directly or below nothing but
-    Stable-Baselines3's ``Monitor`` and Gymnasium's ``TimeLimit``, ``OrderEnforcing`` and ``PassiveEnvChecker``, it is
-    called in place of the loop over ``step``. Gymnasium's HalfCheetah, Swimmer, Hopper and Walker2d (v5) are given one.
+    Stable-Baselines3's ``Monitor`` and Gymnasium's ``OrderEnforcing`` and ``PassiveEnvChecker``, it is called in place of
+    the loop over ``step``.
 
     Example:
         >>> import gymnasium as gym

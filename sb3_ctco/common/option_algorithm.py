@@ -44,7 +44,7 @@ from sb3_ctco.common.buffers import DictOptionReplayBuffer, OptionReplayBuffer
 from sb3_ctco.common.callbacks import OptionProgressBarCallback, PrimitiveStepCallback, eval_callbacks
 from sb3_ctco.common.load_arguments import check_load_arguments
 from sb3_ctco.option_array import OptionArray
-from sb3_ctco.options import DurationScale, Join, OptionSpace, Trajectory, discount_rate_from_gamma, step_weight
+from sb3_ctco.options import DurationScale, Join, OptionSpace, Trajectory, discount_rate_from_gamma
 from sb3_ctco.vec_env import PLAYED, AsyncOptionVecEnv
 from sb3_ctco.wrappers import OptionExecutionWrapper, find_dt
 
@@ -68,8 +68,8 @@ class OptionOffPolicyAlgorithm(OffPolicyAlgorithm):
     :param trajectory: how ω becomes actions, a name in ``sb3_ctco.options.TRAJECTORIES`` or a class
     :param duration_scale: ``"log"`` or ``"linear"``, see :class:`~sb3_ctco.options.OptionSpace`
     :param join: ``"free"`` or ``"continuous"``, see :class:`~sb3_ctco.wrappers.OptionExecutionWrapper`
-    :param reward_scale: what R is multiplied by for the critics, or ``"gamma_dt"`` for the unit of a reward of 1 over
-        ``gamma_dt``
+    :param reward_scale: what R is multiplied by for the critics, or ``"auto"``, see
+        :class:`~sb3_ctco.common.buffers.OptionReplayBuffer`
     :param gamma: discount factor over ``gamma_dt`` seconds, in (0, 1]
     :param gamma_dt: in s
     :param train_freq: collect at least this many primitive steps (in each environment) between trainings
@@ -115,7 +115,7 @@ class OptionOffPolicyAlgorithm(OffPolicyAlgorithm):
         trajectory: str | type[Trajectory] = "rbf",
         duration_scale: DurationScale = "linear",
         join: Join = "free",
-        reward_scale: float | Literal["gamma_dt"] = 1.0,
+        reward_scale: float | Literal["auto"] = 1.0,
         gamma: float,
         gamma_dt: float,
         updates_per_second: float | None,
@@ -131,15 +131,15 @@ class OptionOffPolicyAlgorithm(OffPolicyAlgorithm):
         self.trajectory = trajectory
         self.duration_scale: DurationScale = duration_scale
         self.join: Join = join
-        self.reward_scale: float | Literal["gamma_dt"] = reward_scale
+        self.reward_scale: float | Literal["auto"] = reward_scale
         self.gamma = gamma
         self.gamma_dt = gamma_dt
         # An explicit dt stays the user's word on any environment; one that was found must be found again.
         self._dt_was_given = dt is not None
         #: τ, in 1/s
         self.discount_rate = discount_rate_from_gamma(gamma, gamma_dt)
-        if reward_scale != "gamma_dt" and not (isinstance(reward_scale, int | float) and 0 < reward_scale < math.inf):
-            raise ValueError(f"reward_scale must be a positive number or 'gamma_dt', not {reward_scale!r}")
+        if reward_scale != "auto" and not (isinstance(reward_scale, int | float) and 0 < reward_scale < math.inf):
+            raise ValueError(f"reward_scale must be a positive number or 'auto', not {reward_scale!r}")
         if updates_per_second is not None:
             if gradient_steps != -1:
                 raise ValueError(
@@ -302,6 +302,7 @@ class OptionOffPolicyAlgorithm(OffPolicyAlgorithm):
         env = self._wrap_env(self._as_option_env(env), self.verbose)
         self._check_env(env)
         super().set_env(env, force_reset)
+        self._tell_buffer()
 
     @classmethod
     def load(
@@ -375,17 +376,23 @@ class OptionOffPolicyAlgorithm(OffPolicyAlgorithm):
             )
         # Once more, since load may have changed gamma.
         self.discount_rate = discount_rate_from_gamma(self.gamma, self.gamma_dt)
-        scale = 1.0 / step_weight(self.gamma_dt, self.discount_rate) if self.reward_scale == "gamma_dt" else self.reward_scale
-        self.replay_buffer_kwargs = {
-            **self.replay_buffer_kwargs,
-            "discount_rate": self.discount_rate,
-            "reward_scale": scale,
-        }
+        kwargs = {**self.replay_buffer_kwargs, "discount_rate": self.discount_rate}
+        if self.reward_scale != "auto":
+            kwargs["reward_scale"] = self.reward_scale
+        # What "auto" found stays, since critics learned with it.
+        self.replay_buffer_kwargs = {"reward_scale": "auto", **kwargs}
         if self.env is not None:
             settings = self._check_env(self.env)
             self.dt, self.d_min = settings.dt, settings.d_min
         super()._setup_model()
+        self._tell_buffer()
         self._warn_of_a_large_buffer()
+
+    def _tell_buffer(self) -> None:
+        """Tell the replay buffer what options mean, for the trajectories that are added to it."""
+        buffer = self.replay_buffer
+        if isinstance(buffer, OptionReplayBuffer | DictOptionReplayBuffer) and None not in (self.dt, self.d_min):
+            buffer.option_space, buffer.primitive_action_space = self.option_space, self.primitive_action_space
 
     def _warn_of_a_large_buffer(self) -> None:
         buffer, available = self.replay_buffer, _available_memory()
@@ -418,6 +425,7 @@ class OptionOffPolicyAlgorithm(OffPolicyAlgorithm):
                 f"discount_rate={self.discount_rate}: load it into a model with the same gamma and gamma_dt"
             )
         buffer.reward_scale = self.replay_buffer_kwargs["reward_scale"]
+        self._tell_buffer()
 
     def _init_callback(self, callback: MaybeCallback, progress_bar: bool = False) -> BaseCallback:
         if isinstance(callback, list):

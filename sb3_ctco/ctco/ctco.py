@@ -72,8 +72,9 @@ class CTCO(SoftOptionActorCritic):
     :param duration_scale: ``"linear"``, the paper's, or ``"log"``, see :class:`~sb3_ctco.options.OptionSpace`
     :param join: where an option's actions begin: wherever its weights say (``"free"``, the paper's way), or at the action that
         is being sent then (``"continuous"``), see :class:`~sb3_ctco.wrappers.OptionExecutionWrapper`
-    :param reward_scale: what R is multiplied by for the critics, a number, or ``"gamma_dt"`` for a unit in which a reward of 1
-        over ``gamma_dt`` is worth 1, as a reward is to SAC at that rate. β_h and temperatures are in the unit of what results
+    :param reward_scale: what R is multiplied by for the critics, a number, or ``"auto"`` for a unit that does not depend on
+        that of rewards, in which the best option before learning, if it were repeated forever, is worth 100. β_h and
+        temperatures are in the unit of what results
     :param high_freq_penalty: β_h, subtracted once a decision in the critic's target, or a function of the remaining
         progress
     :param target_decision_rate: in Hz, in place of a fixed β_h: ``high_freq_penalty`` is where β_h starts, and it rises
@@ -140,7 +141,7 @@ class CTCO(SoftOptionActorCritic):
         trajectory: str | type[Trajectory] = "rbf",
         duration_scale: DurationScale = "linear",
         join: Join = "free",
-        reward_scale: float | Literal["gamma_dt"] = 1.0,
+        reward_scale: float | Literal["auto"] = 1.0,
         high_freq_penalty: float | Schedule = 0.003,
         target_decision_rate: float | None = None,
         ent_coef: str | float = "auto_0.02",
