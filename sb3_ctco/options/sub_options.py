@@ -113,6 +113,7 @@ def sub_options(
     truncated: bool,
     reward_unit: RewardUnit = "rate",
     tolerance: float = 0.1,
+    before: FloatArray | None = None,
 ) -> SubOptions:
     """Transitions of stretches of an option; at the episode's end they end with it, or are dropped.
 
@@ -126,6 +127,7 @@ def sub_options(
     :param truncated: whether it was truncated with it
     :param reward_unit: ``"rate"`` or ``"impulse"``, see :func:`~sb3_ctco.options.integrated_reward`
     :param tolerance: largest deviation that a stretch's fitted actions may have, normalised
+    :param before: with a continuous join the normalised action that was being sent when the option began, ``[action_dim]``
     """
     n_ran = len(rewards)
     firsts, ends = np.array(stretches, dtype=np.int64).reshape(-1, 2).T
@@ -133,7 +135,7 @@ def sub_options(
         ends = np.minimum(ends, n_ran)
         long_enough = ends - firsts >= shortest_steps(space)
         firsts, ends = firsts[long_enough], ends[long_enough]
-    omega, residuals = space.trajectory.fit(plan, firsts, ends)
+    omega, residuals = space.trajectory.fit(plan, firsts, ends, before)
     kept = residuals <= tolerance
     if not kept.all():
         firsts, ends, omega, residuals = firsts[kept], ends[kept], omega[kept], residuals[kept]
