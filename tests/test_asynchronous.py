@@ -303,8 +303,9 @@ def test_the_journal_keeps_what_the_replay_buffer_holds(tmp_path):
     assert not (tmp_path / "journal" / "000000.journal").exists()
 
 
-def test_sub_options_are_in_the_learners_replay_buffer(tmp_path):
-    arguments = {"n_sub_options": 4, "d_max": 0.5}
+@pytest.mark.parametrize("join", ["free", "continuous"])
+def test_sub_options_are_in_the_learners_replay_buffer(tmp_path, join):
+    arguments = {"n_sub_options": 4, "d_max": 0.5, "join": join}
     # With random options only, so that both do the same.
     there = make_model(CTCO, env := Point(), **arguments)
     there.learning_starts = 1000
@@ -325,12 +326,13 @@ def test_exception_of_the_environment_stops_both(tmp_path):
     env = Point(fail_at=60)
     model = make_model(SAC, env)
     with AsynchronousTrainer(model, env, tmp_path) as trainer, pytest.raises(ConnectionError, match="cable"):
+        before = {*vars(model)}
         trainer.learn(1000)
     assert env.commands[-1] == 0.0
     assert len(env.commands) == 61
     assert len(records_of(tmp_path)) == 59
     assert SAC.load(tmp_path / "model.zip").num_timesteps <= 59
-    assert "train" not in model.__dict__
+    assert {*vars(model)} - before <= {"start_time", "_logger"}, "nothing is left on the model that hides its own methods"
 
 
 class KillLearner(BaseCallback):

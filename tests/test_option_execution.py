@@ -2,6 +2,7 @@ import math
 
 import gymnasium as gym
 import numpy as np
+import pandas as pd
 import pytest
 from gymnasium import spaces
 from gymnasium.error import ResetNeeded
@@ -346,11 +347,11 @@ def play_random(env, n_options=60):
     for _ in range(n_options):
         obs, reward, terminated, truncated, info = env.step(env.action_space.sample())
         info = {key: value for key, value in info.items() if key != "episode"} | {
-            key: info["episode"][key] for key in ("r", "l") if "episode" in info
+            key: value for key, value in info.get("episode", {}).items() if key != "t"
         }
         trace.append((obs, reward, terminated, truncated, info))
         if terminated or truncated:
-            env.reset()
+            env.reset(seed=len(trace))
     return trace
 
 
@@ -360,19 +361,39 @@ def assert_same_trace(left, right):
 
 
 @pytest.mark.parametrize("end", [{"terminate_at": 25}, {"truncate_at": 25}])
-def test_step_sequence_is_used_below_monitor_and_changes_nothing(scripted_env, end):
+def test_step_sequence_is_used_below_monitor_and_changes_nothing(scripted_env, end, tmp_path):
     def rewards(step, action):
         return 0.5 * step - float(action[0])
 
-    plain = Monitor(scripted_env(rewards=rewards, **end))
+    def monitored(env, name):
+        # Whoever gives a file wants to know the seed and the environment's count of each episode, too.
+        return Monitor(env, str(tmp_path / name), reset_keywords=("seed",), info_keywords=("count",))
+
+    plain = monitored(scripted_env(rewards=rewards, **end), "plain")
     sequence = SequenceEnv(scripted_env(rewards=rewards, **end))
     assert isinstance(sequence, SupportsStepSequence)
-    fast = Monitor(sequence)
+    fast = monitored(sequence, "fast")
     assert_same_trace(play_random(wrap(plain)), play_random(wrap(fast)))
     assert sequence.calls == 60
     assert fast.get_episode_rewards() == plain.get_episode_rewards()
     assert fast.get_episode_lengths() == plain.get_episode_lengths() == [25] * len(plain.get_episode_lengths())
     assert fast.get_total_steps() == plain.get_total_steps()
+    assert fast.needs_reset == plain.needs_reset
+    assert fast.get_episode_times() == sorted(fast.get_episode_times())
+    assert len(fast.get_episode_times()) == len(fast.get_episode_lengths())
+    plain_rows, fast_rows = (pd.read_csv(tmp_path / f"{name}.monitor.csv", skiprows=1) for name in ("plain", "fast"))
+    pd.testing.assert_frame_equal(fast_rows.drop(columns="t"), plain_rows.drop(columns="t"))
+    assert list(fast_rows) == ["r", "l", "t", "seed", "count"]
+
+
+def test_a_time_limit_sees_each_step(scripted_env):
+    sequence = SequenceEnv(scripted_env())
+    env = wrap(Monitor(TimeLimit(sequence, 7)), d_max=0.5)
+    env.reset()
+    assert env.step([0.0, 1.0])[3] is False
+    _, _, terminated, truncated, info = env.step([0.0, 1.0])
+    assert (terminated, truncated, info["option"]["n_steps"], info["episode"]["l"]) == (False, True, 2, 7)
+    assert sequence.calls == 0
 
 
 def test_a_wrapper_that_looks_at_each_step_gets_to_see_it(scripted_env):
@@ -452,3 +473,23 @@ def test_time_limit_inside_counts_primitive_steps(scripted_env):
     _, _, _, truncated, info = env.step([0.0, 1.0])
     assert truncated
     assert info["option"]["n_steps"] == 2
+
+
+@pytest.mark.parametrize(
+    ("dt", "gamma", "gamma_dt", "expected"),
+    [
+        (0.002, 0.98, 0.05, (0.0247, 0.495)),  # 500 Hz, the paper's discount: a hundredth and a fifth of 2.475 s
+        (0.05, 0.98, 0.05, (0.05, 0.495)),  # a step is longer
+        (0.008, 0.99, 0.008, (0.008, 0.159)),  # SAC's discount at 125 Hz
+        (0.05, 0.999, 0.05, (0.05, 0.495)),  # 50 s ahead, but not an option of 10 s
+        (0.002, 1.0, 0.05, (0.0247, 0.495)),
+    ],
+)
+def test_durations_follow_from_rate_and_discount(scripted_env, dt, gamma, gamma_dt, expected):
+    model = CTCO("MlpPolicy", scripted_env(dt=dt), gamma=gamma, gamma_dt=gamma_dt, device="cpu")
+    space = model.option_space
+    assert (space.d_min, space.d_max) == pytest.approx(expected, abs=5e-4)
+    wrapped = OptionExecutionWrapper(scripted_env(dt=dt), discount_rate=model.discount_rate)
+    assert wrapped.option_space == space
+    assert CTCO("MlpPolicy", wrapped, gamma=gamma, gamma_dt=gamma_dt, device="cpu").option_space == space
+    assert OptionExecutionWrapper(scripted_env(dt=dt), d_min=0.0).option_space.d_min == dt

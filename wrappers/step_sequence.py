@@ -1,8 +1,9 @@
 """Play several primitive steps in one call, where nobody needs to see each of them."""
 
 import inspect
+import time
 from collections.abc import Callable, Sequence
-from types import SimpleNamespace
+from functools import partial
 from typing import Any, Protocol, runtime_checkable
 
 import gymnasium as gym
@@ -11,13 +12,8 @@ import numpy.typing as npt
 from gymnasium.wrappers import OrderEnforcing, PassiveEnvChecker
 from stable_baselines3.common.monitor import Monitor
 
-from sb3_ctco.wrappers.gymnasium_mujoco import find_rollout
-
 SequenceResult = tuple[Any, npt.ArrayLike, bool, bool, dict[str, Any]]
 StepSequence = Callable[..., SequenceResult]
-
-#: Gymnasium's TimeLimit, and that which RL Zoo puts in its place
-_TIME_LIMITS = ("gymnasium.wrappers.common.TimeLimit", "rl_zoo3.gym_patches.PatchedTimeLimit")
 
 
 @runtime_checkable
@@ -50,50 +46,29 @@ def find_step_sequence(env: gym.Env, observing: bool) -> StepSequence | None:
         return find_step_sequence(env.env, observing)  # type: ignore[attr-defined]
     if type(env) is Monitor:
         inner = find_step_sequence(env.env, observing)
-        return None if inner is None else _monitored(env, inner)
-    if isinstance(env, gym.Wrapper) and f"{type(env).__module__}.{type(env).__name__}" in _TIME_LIMITS:
-        inner = find_step_sequence(env.env, observing)
-        return None if inner is None else _time_limited(env, inner)
-    return find_rollout(env)
+        return None if inner is None else partial(_play_monitored, env, inner)
+    return None
 
 
-def _time_limited(env: gym.Wrapper, play: StepSequence) -> StepSequence:
-    """Keep a TimeLimit's count over a sequence of steps that it does not see one by one."""
-
-    def step_sequence(actions: np.ndarray, observe: Sequence[int] = ()) -> SequenceResult:
-        limit: Any = env
-        actions = actions[: max(1, limit._max_episode_steps - limit._elapsed_steps)]
-        on_the_way = [k for k in observe if k < len(actions)]
-        obs, rewards, terminated, truncated, info = play(actions, on_the_way) if on_the_way else play(actions)
-        rewards = np.asarray(rewards, dtype=np.float64)
-        limit._elapsed_steps += len(rewards) - 1
-        last_step = (obs, rewards[-1], terminated, truncated, info)
-        obs, _, terminated, truncated, info = _see_last_step(env, actions[len(rewards) - 1], last_step)
-        return obs, rewards, terminated, truncated, info
-
-    return step_sequence
-
-
-def _monitored(monitor: Monitor, play: StepSequence) -> StepSequence:
-    """Keep a Monitor's books over a sequence of steps that it does not see one by one."""
-
-    def step_sequence(actions: np.ndarray, *observe: Sequence[int]) -> SequenceResult:
-        obs, rewards, terminated, truncated, info = play(actions, *observe)
-        rewards = np.asarray(rewards, dtype=np.float64)
-        monitor.rewards.extend(rewards[:-1].tolist())
-        monitor.total_steps += len(rewards) - 1
-        last_step = (obs, rewards[-1], terminated, truncated, info)
-        obs, _, terminated, truncated, info = _see_last_step(monitor, actions[len(rewards) - 1], last_step)
-        return obs, rewards, terminated, truncated, info
-
-    return step_sequence
-
-
-def _see_last_step(wrapper: gym.Wrapper, action: np.ndarray, result: tuple[Any, ...]) -> tuple[Any, ...]:
-    """What a wrapper's own ``step`` makes of a step that was made already."""
-    env = wrapper.env
-    wrapper.env = SimpleNamespace(step=lambda _: result)  # type: ignore[assignment]
-    try:
-        return wrapper.step(action)
-    finally:
-        wrapper.env = env
+def _play_monitored(monitor: Monitor, play: StepSequence, actions: np.ndarray, *observe: Sequence[int]) -> SequenceResult:
+    """Play, and keep the Monitor's books: those of ``Monitor.step`` (Stable-Baselines3 2.9.2), of several steps at once."""
+    obs, rewards, terminated, truncated, info = play(actions, *observe)
+    rewards = np.asarray(rewards, dtype=np.float64)
+    monitor.rewards.extend(rewards.tolist())
+    monitor.total_steps += len(rewards)
+    if terminated or truncated:
+        monitor.needs_reset = True
+        seconds = time.time() - monitor.t_start
+        monitor.episode_returns.append(sum(monitor.rewards))
+        monitor.episode_lengths.append(len(monitor.rewards))
+        monitor.episode_times.append(seconds)
+        info["episode"] = {
+            "r": round(monitor.episode_returns[-1], 6),
+            "l": monitor.episode_lengths[-1],
+            "t": round(seconds, 6),
+            **{key: info[key] for key in monitor.info_keywords},
+            **monitor.current_reset_info,
+        }
+        if monitor.results_writer:
+            monitor.results_writer.write_row(info["episode"])
+    return obs, rewards, terminated, truncated, info

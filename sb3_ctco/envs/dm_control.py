@@ -11,8 +11,6 @@ import gymnasium as gym
 import numpy as np
 from gymnasium import spaces
 
-from sb3_ctco.wrappers.gymnasium_mujoco import rollout_inputs
-
 try:
     import mujoco
     from mujoco.rollout import Rollout
@@ -205,7 +203,7 @@ class DMControlEnv(gym.Env[np.ndarray, np.ndarray]):
         leaves them, repeats mj_step1 once and is otherwise the same.
         """
         model, data, n_sub_steps = self._model, self._data, self._n_sub_steps
-        inputs = rollout_inputs(model, data, actions, n_sub_steps)
+        inputs = _rollout_inputs(model, data, actions, n_sub_steps)
         start = np.empty((1, mujoco.mj_stateSize(model, _STATE)))
         mujoco.mj_getState(model, data, start[0], _STATE)
         states = np.empty((1, inputs.shape[1], start.shape[1]))
@@ -265,6 +263,23 @@ class DMControlEnv(gym.Env[np.ndarray, np.ndarray]):
             return np.concatenate(joints, dtype=np.float32, casting="same_kind")
         leaves = [np.ravel(value) for value in _leaves(self._task.get_observation(self._physics))]
         return np.concatenate(leaves, dtype=np.float32, casting="same_kind")
+
+
+def _rollout_inputs(model: mujoco.MjModel, data: mujoco.MjData, actions: np.ndarray, n_frames: int) -> np.ndarray:
+    """What ``mujoco.rollout`` is to set before each frame: actions, and all else that is a user's as it stands.
+
+    That is external forces (``xfrc_applied``, ``qfrc_applied``), mocap bodies, which equalities are active, and user
+    data: mujoco.rollout resets what it is not given.
+
+    :param actions: ``[n_steps, nu]``
+    :param n_frames: how many frames of the simulation a step has
+    :return: ``[1, n_steps · n_frames, size of mjSTATE_USER]``, which begins with the actions
+    """
+    inputs = np.empty(mujoco.mj_stateSize(model, _USER))
+    mujoco.mj_getState(model, data, inputs, _USER)
+    inputs = np.tile(inputs, (1, len(actions) * n_frames, 1))
+    inputs[0, :, : model.nu] = np.repeat(actions, n_frames, axis=0)
+    return inputs
 
 
 @contextlib.contextmanager
