@@ -2,17 +2,84 @@
 
 from typing import Any
 
+import gymnasium as gym
 import numpy as np
+from gymnasium import spaces
+from gymnasium.utils import RecordConstructorArgs
 from stable_baselines3 import SAC
 from stable_baselines3.common.base_class import maybe_make_env
+from stable_baselines3.common.callbacks import BaseCallback, CallbackList
 from stable_baselines3.common.env_util import unwrap_wrapper
 from stable_baselines3.common.monitor import Monitor
-from stable_baselines3.common.type_aliases import GymEnv
+from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback
 from stable_baselines3.common.vec_env import VecEnv
 from stable_baselines3.sac.policies import SACPolicy
 
+from sb3_ctco.common.buffers import OptionReplayBuffer
+from sb3_ctco.common.callbacks import OptionProgressBarCallback, PrimitiveStepCallback
 from sb3_ctco.options import OptionSpace, discount, discount_rate_from_gamma, step_weight
-from sb3_ctco.wrappers import RewardRateWrapper
+from sb3_ctco.wrappers import OptionExecutionWrapper, RewardRateWrapper
+
+
+class FixedDurationWrapper(gym.ActionWrapper, RecordConstructorArgs):
+    """Options that all take the longest duration: an action is their weights alone.
+
+    An agent with entropy would otherwise be paid for the noise of a duration that changes nothing.
+
+    :param env: in an :class:`~sb3_ctco.wrappers.OptionExecutionWrapper`
+    """
+
+    def __init__(self, env: gym.Env):
+        RecordConstructorArgs.__init__(self)
+        gym.ActionWrapper.__init__(self, env)
+        (option_dim,) = env.action_space.shape  # type: ignore[misc]
+        self.action_space = spaces.Box(-1.0, 1.0, (option_dim - 1,), np.float32)
+
+    def action(self, action: np.ndarray) -> np.ndarray:
+        """The option of these weights."""
+        return np.append(action, 1.0)
+
+    def plan(self, action: np.ndarray) -> np.ndarray:
+        """The primitive actions that it plays, ``[n_steps, *action_shape]``."""
+        return self.env.get_wrapper_attr("plan")(self.action(action))
+
+
+class _SACOnOptions(SAC):
+    """SAC that counts primitive steps, and updates by them, although it decides once an option."""
+
+    updates_per_step = 0.0
+    _updates_due = 0.0
+    _n_seen = 0
+
+    def _init_callback(self, callback: MaybeCallback, progress_bar: bool = False) -> BaseCallback:
+        self._n_seen = self.num_timesteps
+        counting: list[BaseCallback] = [PrimitiveStepCallback(super()._init_callback(callback))]
+        if progress_bar:
+            counting.append(OptionProgressBarCallback())
+        callbacks = CallbackList(counting)
+        callbacks.init_callback(self)
+        return callbacks
+
+    def train(self, gradient_steps: int, batch_size: int = 64) -> None:
+        """The updates that are due, in place of a number a decision."""
+        self._updates_due += self.updates_per_step * (self.num_timesteps - max(self._n_seen, self.learning_starts))
+        self._n_seen = self.num_timesteps
+        if self._updates_due >= 1:
+            super().train(int(self._updates_due), batch_size)
+            self._updates_due %= 1
+
+
+class _PricedReplayBuffer(OptionReplayBuffer):
+    """Decisions cost something, which is subtracted where they are sampled: what is recorded of them stays as it is."""
+
+    def __init__(self, *args: Any, decision_price: float = 0.0, **kwargs: Any):
+        super().__init__(*args, **kwargs)
+        self.decision_price = decision_price
+
+    def _sample_fields(self, *args: Any) -> dict[str, Any]:
+        fields = super()._sample_fields(*args)
+        fields["rewards"] -= self.decision_price * self._found_reward_scale()
+        return fields
 
 
 def update_schedule(updates_per_step: float, tolerance: float = 1e-3) -> tuple[int, int]:
@@ -36,6 +103,11 @@ def sac_at_rate(
     gamma_dt: float = 0.05,
     learning_starts_seconds: float = 60.0,
     policy: str | type[SACPolicy] = "MlpPolicy",
+    hold_seconds: float | None = None,
+    n_rbf: int = 1,
+    learned_duration: bool = False,
+    decision_price: float = 0.0,
+    pink_noise_seconds: float | None = None,
     **kwargs: Any,
 ) -> SAC:
     """A plain SAC that at every ``dt`` learns as often a second, for the same discounted return.
@@ -44,6 +116,10 @@ def sac_at_rate(
     (:class:`~sb3_ctco.wrappers.RewardRateWrapper`) in the unit of a reward of 1 over ``gamma_dt``, and its ``train_freq`` and
     ``gradient_steps`` are the smallest that give ``updates_per_second`` to a thousandth. With ``gamma_dt = dt`` it is stock
     SAC on the rewards as they are. This is the SAC of the paper's section "Empirical Analysis".
+
+    With ``hold_seconds`` it decides less often, as with an action repeat of ``hold_seconds/dt`` steps: each decision is an
+    option of that duration, whose reward is integrated and discounted over the time that it ran. Steps are still primitive
+    ones in ``learn``, ``num_timesteps`` and callbacks.
 
     Example:
         >>> model = sac_at_rate("Pendulum-v1", dt=0.05, updates_per_second=5)
@@ -58,6 +134,14 @@ def sac_at_rate(
     :param gamma_dt: in s
     :param learning_starts_seconds: act at random for this long before learning, in s of task time
     :param policy: SAC's policy
+    :param hold_seconds: decide this often, in s; each step by default
+    :param n_rbf: number of weights an action dimension that a decision has; 1 holds an action for ``hold_seconds``, more make
+        it a chunk of that length
+    :param learned_duration: whether a decision also says how long it takes, from one step to ``hold_seconds``
+    :param decision_price: what a decision costs, in reward × s; with ``n_rbf=1`` and ``learned_duration`` this is TaCoS
+        (Treven et al. 2024, "When to Sense and Control?", https://arxiv.org/abs/2406.01163) with SAC
+    :param pink_noise_seconds: explore with pink noise, in pieces of this length in s, usually an episode's; it is the
+        ``PinkNoiseDist`` of the package ``pink-noise-rl``
     :param kwargs: SAC's further arguments
     :return: a ``stable_baselines3.SAC``
     :raises ValueError: for settings out of range, or that contradict the environment's
@@ -78,19 +162,61 @@ def sac_at_rate(
     if not (learning_starts_seconds >= 0 and np.isfinite(learning_starts_seconds)):
         raise ValueError(f"learning_starts_seconds must be at least 0, not {learning_starts_seconds}")
 
+    for name, seconds in (("hold_seconds", hold_seconds), ("pink_noise_seconds", pink_noise_seconds)):
+        if seconds is not None and not dt - 1e-9 <= seconds < np.inf:
+            raise ValueError(f"{name} must be None, or at least a step of {dt} s, not {seconds}")
+    if hold_seconds is None and (n_rbf, learned_duration, decision_price) != (1, False, 0.0):
+        raise ValueError(
+            f"n_rbf={n_rbf}, learned_duration={learned_duration} and decision_price={decision_price} are of decisions that "
+            "take several steps: pass hold_seconds"
+        )
+
     reward_scale = 1.0 / step_weight(gamma_dt, discount_rate)
-    env = _with_reward_rate(maybe_make_env(env, kwargs.get("verbose", 0)), dt, discount_rate, reward_scale)
-    n_envs = env.num_envs if isinstance(env, VecEnv) else 1
-    train_freq, gradient_steps = update_schedule(updates_per_second * dt * n_envs)
-    return SAC(
-        policy,
-        env,
-        gamma=float(discount(dt, discount_rate)),
-        train_freq=train_freq,
-        gradient_steps=gradient_steps,
-        learning_starts=round(learning_starts_seconds / dt),
-        **kwargs,
-    )
+    env = maybe_make_env(env, kwargs.get("verbose", 0))
+    clock: dict[str, Any] = {
+        "gamma": float(discount(dt, discount_rate)),
+        "learning_starts": round(learning_starts_seconds / dt),
+    }
+    if hold_seconds is None:
+        env = _with_reward_rate(env, dt, discount_rate, reward_scale)
+        n_envs = env.num_envs if isinstance(env, VecEnv) else 1
+        train_freq, gradient_steps = update_schedule(updates_per_second * dt * n_envs)
+        model = SAC(policy, env, train_freq=train_freq, gradient_steps=gradient_steps, **clock, **kwargs)
+    else:
+        # The buffer has the discount of each decision, so gamma is not used.
+        buffer = {"discount_rate": discount_rate, "reward_scale": reward_scale, "decision_price": decision_price}
+        kwargs |= {"replay_buffer_class": _PricedReplayBuffer, "replay_buffer_kwargs": buffer}
+        env = hold_actions(env, hold_seconds, n_rbf, learned_duration, dt, discount_rate)
+        model = _SACOnOptions(policy, env, **clock, **kwargs)
+        model.updates_per_step = updates_per_second * dt
+    if pink_noise_seconds is not None:
+        _explore_with_pink_noise(model, round(pink_noise_seconds / (hold_seconds or dt)))
+    return model
+
+
+def hold_actions(
+    env: GymEnv, hold_seconds: float, n_rbf: int, learned_duration: bool, dt: float, discount_rate: float
+) -> gym.Env:
+    """An environment of decisions that take ``hold_seconds``, as :func:`sac_at_rate` makes it.
+
+    :raises ValueError: for a VecEnv
+    """
+    if isinstance(env, VecEnv):
+        raise ValueError("hold_seconds is for a single environment, which sac_at_rate wraps: pass that in place of a VecEnv")
+    if unwrap_wrapper(env, Monitor) is None:
+        env = Monitor(env)
+    shortest = dt if learned_duration else hold_seconds
+    options = OptionExecutionWrapper(env, n_rbf, hold_seconds, shortest, dt, discount_rate, duration_scale="linear")
+    return options if learned_duration else FixedDurationWrapper(options)
+
+
+def _explore_with_pink_noise(model: SAC, n_decisions: int) -> None:
+    try:
+        from pink import PinkNoiseDist  # noqa: PLC0415
+    except ImportError as error:
+        raise ImportError("pink_noise_seconds needs the package pink-noise-rl: run pip install pink-noise-rl") from error
+    (action_dim,) = model.action_space.shape  # type: ignore[misc]
+    model.actor.action_dist = PinkNoiseDist(n_decisions, action_dim, rng=np.random.default_rng(model.seed))
 
 
 def _with_reward_rate(env: GymEnv, dt: float, discount_rate: float, reward_scale: float) -> GymEnv:

@@ -20,9 +20,9 @@ from sb3_ctco.common.option_algorithm import OptionOffPolicyAlgorithm
 from sb3_ctco.ctco import CTCO
 from sb3_ctco.dac_ppo import DACPPO
 from sb3_ctco.figar_sac import FiGARSAC
-from sb3_ctco.fixed_rate import sac_at_rate
-from sb3_ctco.options import discount_rate_from_gamma
-from sb3_ctco.wrappers import RewardRateWrapper, find_dt
+from sb3_ctco.fixed_rate import FixedDurationWrapper, hold_actions, sac_at_rate
+from sb3_ctco.options import OptionSpace, discount_rate_from_gamma
+from sb3_ctco.wrappers import OptionExecutionWrapper, RewardRateWrapper, find_dt
 
 
 @dataclass(frozen=True)
@@ -161,6 +161,32 @@ def _with_reward_rate(make_env: Callable[[], gym.Env], dt: float, discount_rate:
     return DummyVecEnv([lambda: RewardRateWrapper(Monitor(make_env()), dt=dt, discount_rate=discount_rate)] * n_envs)
 
 
+def _make_sac_eval_env(model: SAC, make_env: Callable[[], gym.Env], dt: float, discount_rate: float) -> VecEnv:
+    env = model.get_env()
+    assert env is not None
+    if not env.env_is_wrapped(OptionExecutionWrapper)[0]:
+        return _with_reward_rate(make_env, dt, discount_rate)
+    options: OptionSpace = env.get_attr("option_space")[0]
+    held = options.d_max, options.trajectory.n_weights, not env.env_is_wrapped(FixedDurationWrapper)[0], dt, discount_rate
+    return DummyVecEnv([lambda: hold_actions(make_env(), *held)])
+
+
+def _action_repeat_in_seconds(arguments: dict[str, Any], dt: float, episode_seconds: float) -> dict[str, Any]:
+    """``action_repeat``, a number of steps at every rate, is the one argument whose time depends on the rate."""
+    if "action_repeat" in arguments:
+        arguments["hold_seconds"] = arguments.pop("action_repeat") * dt
+    return arguments
+
+
+#: Of stock SAC and what practitioners do about high rates: rows that differ in their arguments alone, told apart in figures
+_SAC: dict[str, Any] = {
+    "constructors": (sac_at_rate, SAC),
+    "make": lambda make_env, dt, arguments: sac_at_rate(make_env(), dt=dt, **arguments),
+    "make_eval_env": _make_sac_eval_env,
+    "in_steps": _action_repeat_in_seconds,
+}
+
+
 def _make_dac_ppo(make_env: Callable[[], gym.Env], dt: float, arguments: dict[str, Any]) -> DACPPO:
     discount_rate = discount_rate_from_gamma(arguments["gamma"], arguments["gamma_dt"])
     env = _with_reward_rate(make_env, dt, discount_rate, arguments.pop("n_envs", 1))
@@ -190,15 +216,7 @@ ALGORITHMS: dict[str, Algorithm] = {
     algorithm.name: algorithm
     for algorithm in (
         Algorithm("ctco", "CTCO", "C0", **_of_options(CTCO)),
-        Algorithm(
-            "sac",
-            "SAC",
-            "C1",
-            constructors=(sac_at_rate, SAC),
-            make=lambda make_env, dt, arguments: sac_at_rate(make_env(), dt=dt, **arguments),
-            make_eval_env=lambda model, make_env, dt, discount_rate: _with_reward_rate(make_env, dt, discount_rate),
-            in_steps=lambda arguments, dt, episode_seconds: arguments,
-        ),
+        Algorithm("sac", "SAC", "C1", **_SAC),
         Algorithm("figar_sac", "FiGAR-SAC", "C2", **_of_options(FiGARSAC)),
         Algorithm(
             "dac_ppo",
@@ -210,5 +228,10 @@ ALGORITHMS: dict[str, Algorithm] = {
             in_steps=_rollouts_in_steps,
             zoo_class=DACPPO,
         ),
+        Algorithm("sac_repeat", "SAC, action repeat", "C4", **_SAC),
+        Algorithm("sac_chunks", "SAC, action chunks", "C5", **_SAC),
+        Algorithm("sac_gsde", "SAC, gSDE", "C6", **_SAC),
+        Algorithm("sac_pink", "SAC, pink noise", "C7", **_SAC),
+        Algorithm("tacos", "TaCoS", "C8", **_SAC),
     )
 }

@@ -303,8 +303,9 @@ def test_the_journal_keeps_what_the_replay_buffer_holds(tmp_path):
     assert not (tmp_path / "journal" / "000000.journal").exists()
 
 
-def test_sub_options_are_in_the_learners_replay_buffer(tmp_path):
-    arguments = {"n_sub_options": 4, "d_max": 0.5}
+@pytest.mark.parametrize("join", ["free", "continuous"])
+def test_sub_options_are_in_the_learners_replay_buffer(tmp_path, join):
+    arguments = {"n_sub_options": 4, "d_max": 0.5, "join": join}
     # With random options only, so that both do the same.
     there = make_model(CTCO, env := Point(), **arguments)
     there.learning_starts = 1000

@@ -193,3 +193,19 @@ def test_memory_of_a_transition():
     buffer = DictOptionReplayBuffer(10, space, spaces.Box(-1, 1, (22,)), device="cpu")
     assert buffer.bytes_per_transition == 2 * (80 * 60 * 3 + 21 * 4) + 22 * 4 + 5 * 4 == 29_076
     assert 100_000 * buffer.bytes_per_transition < 3e9
+
+
+@pytest.mark.parametrize("kind", ["vector", "dict"])
+def test_a_scale_that_does_not_depend_on_the_unit_of_rewards(kind):
+    """With γ = 0.5 a second, 3 for 1 s is worth 3/(1 − 0.5) = 6 if it is repeated forever, −4 for 2 s is −4/(1 − 0.25)."""
+    buffer = make_buffer(kind)
+    buffer.reward_scale = "auto"
+    add(buffer, kind, 0, [option_info(1.0, 0.0)])
+    assert buffer._get_samples(np.array([0])).rewards.item() == 0.0
+    assert buffer.reward_scale == "auto"  # nothing was paid
+    add(buffer, kind, 1, [option_info(1.0, 3.0)])
+    add(buffer, kind, 2, [option_info(2.0, -4.0)])
+    rewards = buffer._get_samples(np.arange(3)).rewards[:, 0]
+    np.testing.assert_allclose(rewards, [0.0, 50.0, -4.0 * 100 / 6], rtol=1e-6)
+    add(buffer, kind, 3, [option_info(1.0, 30.0)])
+    assert buffer._get_samples(np.array([3])).rewards.item() == pytest.approx(500.0)  # as critics learned

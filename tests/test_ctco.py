@@ -15,7 +15,7 @@ from torch.distributions import Normal
 from sb3_ctco import CTCO, DictOptionReplayBuffer, OptionExecutionWrapper, OptionReplayBuffer
 from sb3_ctco.common.losses import actor_loss, critic_loss, critic_target, log_reference_density
 from sb3_ctco.ctco.policies import CTCOPolicy, EnsembleLinear, squashed_log_prob
-from sb3_ctco.options import DEFAULT_DISCOUNT_RATE, step_weight
+from sb3_ctco.options import DEFAULT_DISCOUNT_RATE, discount_rate_from_gamma, step_weight
 
 # Without sub-options, so that rows of the buffer are the decisions in their order.
 SMALL = {
@@ -206,18 +206,42 @@ def test_what_a_decision_costs_is_logged(random_walk_env):
     assert logged["option/critic_spread"] == pytest.approx((next_q_values[0] - next_q_values[1]).abs().mean().item())
 
 
-def test_the_unit_of_rewards(random_walk_env):
-    """``"gamma_dt"`` is 1/∫₀^γ_dt e^(−τκ) dκ: an option of one gamma_dt with a reward of 3 all the time is worth 3."""
-    model = make(random_walk_env(), gamma=0.9, gamma_dt=0.1, reward_scale="gamma_dt", n_rbf=1, d_max=0.1)
-    assert model.replay_buffer.reward_scale == pytest.approx(1 / step_weight(0.1, model.discount_rate))
-    model.learn(30)
-    buffer = model.replay_buffer
-    samples = buffer._get_samples(np.arange(10))
-    np.testing.assert_allclose(samples.rewards[:, 0], buffer.rewards[:10, 0], rtol=1e-5)  # one step an option
-    np.testing.assert_allclose(buffer.integrated_rewards[:10, 0] * buffer.reward_scale, samples.rewards[:, 0], rtol=1e-6)
-    for scale in (0.0, -1.0, math.inf, "auto"):
-        with pytest.raises(ValueError, match="reward_scale must be a positive number or 'gamma_dt'"):
-            make(random_walk_env(), reward_scale=scale)
+@pytest.mark.parametrize("scale", [0.0, -1.0, math.inf, "gamma_dt"])
+def test_a_reward_scale_that_is_none(scale, random_walk_env):
+    with pytest.raises(ValueError, match="reward_scale must be a positive number or 'auto'"):
+        make(random_walk_env(), reward_scale=scale)
+
+
+@pytest.mark.parametrize("fast", [True, False])
+def test_units_make_no_difference(fast):
+    """Rewards in another unit, or γ over another gamma_dt: the same networks, but for rounding."""
+
+    def learned(factor=1.0, gamma=0.98, gamma_dt=0.05):
+        env = gym.wrappers.TransformReward(gym.make("Pendulum-v1"), lambda r: factor * r)
+        settings = {"gamma": gamma, "gamma_dt": gamma_dt, "reward_scale": "auto", "d_max": 0.3, "fast_updates": fast}
+        model = make(env, n_sub_options=2, learning_starts=50, policy_kwargs={"net_arch": [16]}, **settings).learn(200)
+        assert model._n_updates > 50
+        return th.nn.utils.parameters_to_vector(model.policy.parameters())
+
+    weights = learned()
+    th.testing.assert_close(learned(factor=128.0), weights, rtol=0, atol=0)  # a power of two rounds nothing
+    th.testing.assert_close(learned(factor=100.0), weights, rtol=1e-3, atol=1e-3)
+    th.testing.assert_close(learned(factor=0.01), weights, rtol=1e-3, atol=1e-3)
+    th.testing.assert_close(learned(gamma=0.98**2, gamma_dt=0.1), weights, rtol=1e-3, atol=1e-3)
+
+
+def test_the_scale_that_was_found_stays(tmp_path, random_walk_env):
+    model = make(random_walk_env(), reward_scale="auto", learning_starts=10)
+    assert model.replay_buffer.reward_scale == "auto"
+    model.learn(30).save(tmp_path / "model")
+    found = model.replay_buffer.reward_scale
+    assert found > 0
+    resumed = CTCO.load(tmp_path / "model", env=random_walk_env())
+    assert resumed.reward_scale == "auto"
+    assert resumed.replay_buffer.reward_scale == found
+    model.save_replay_buffer(tmp_path / "buffer")
+    resumed.load_replay_buffer(tmp_path / "buffer")
+    assert resumed.learn(30, reset_num_timesteps=False).replay_buffer.reward_scale == found
 
 
 def test_a_loaded_buffer_has_the_algorithms_unit_and_discount(tmp_path, random_walk_env):
@@ -234,7 +258,8 @@ def test_with_one_step_options_targets_and_losses_are_sacs():
     kwargs = {"policy_kwargs": {"net_arch": [16]}, "learning_starts": 20, "seed": 0, "device": "cpu", "gamma": 0.97}
     sac = SAC("MlpPolicy", "Pendulum-v1", ent_coef=0.5, **kwargs).learn(60)
     options = {"n_rbf": 1, "d_min": 0.05, "d_max": 0.05, "n_sub_options": 0, "high_freq_penalty": 0.0}
-    unit = {"reward_scale": "gamma_dt", "gamma_dt": 0.05, "entropy_reference": "paper"}
+    tau = discount_rate_from_gamma(0.97, 0.05)
+    unit = {"reward_scale": 1 / step_weight(0.05, tau), "gamma_dt": 0.05, "entropy_reference": "paper"}
     model = CTCO("MlpPolicy", "Pendulum-v1", ent_coef=0.5, **options, **unit, **kwargs).learn(60)
     copy_weights(sac, model)
     # The same experience: an option is a normalised action and a duration; its R is in reward × s.
@@ -706,7 +731,7 @@ def test_bad_action_spaces(scripted_env):
         make(scripted_env(action_space=spaces.Box(-np.inf, np.inf, (1,))))
     with pytest.raises(ValueError, match="pass dt"):
         make(scripted_env(dt=None))
-    assert make(scripted_env(dt=None), dt=0.5).dt == 0.5
+    assert make(scripted_env(dt=None), dt=0.4).dt == 0.4
 
 
 @pytest.mark.parametrize("bad", ["nan reward", "inf reward", "nan observation", "error"])

@@ -1,5 +1,6 @@
 import doctest
 import math
+import sys
 
 import gymnasium as gym
 import numpy as np
@@ -13,7 +14,7 @@ from stable_baselines3.common.monitor import Monitor
 from sb3_ctco import OptionExecutionWrapper, RewardRateWrapper, sac_at_rate
 from sb3_ctco import fixed_rate as module
 from sb3_ctco.evaluation import DiscountedReturnCallback, evaluate_discounted_return
-from sb3_ctco.fixed_rate import update_schedule
+from sb3_ctco.fixed_rate import hold_actions, update_schedule
 from sb3_ctco.options import DEFAULT_DISCOUNT_RATE
 from sb3_ctco.wrappers import reward_rate
 
@@ -182,9 +183,116 @@ def test_environments_that_are_wrapped_already(scripted_env):
         sac_at_rate(make_vec_env(scripted_env, 2), 0.1, **SMALL)
 
 
+# --- fewer decisions, and other noise
+
+
+def test_a_held_action_is_one_semi_markov_decision(scripted_env):
+    """Three steps of 0.1 s a decision, which pay 0, 1, 2, …; γ = 0.9 over 0.1 s, the unit of rewards."""
+    env = scripted_env(rewards=lambda step, action: float(step), dt=0.1, truncate_at=9)
+    model = sac_at_rate(env, 0.1, gamma=0.9, gamma_dt=0.1, learning_starts_seconds=1e3, hold_seconds=0.3, **SMALL)
+    callback = DiscountedReturnCallback()
+    model.learn(30, callback)
+    assert (model.num_timesteps, callback.timesteps) == (30, [9, 18, 27])
+    assert [episode.decisions for episode in callback.episodes] == [3, 3, 3]
+    assert model.action_space.shape == (1,)
+    played = np.array(env.actions)  # of the episode that began last
+    assert np.array_equal(played, np.repeat(played[:1], 3, axis=0))
+    samples = model.replay_buffer._get_samples(np.array([0, 1, 2]))
+    assert samples.rewards.ravel().tolist() == pytest.approx([0.9 + 0.81 * 2, 3 + 0.9 * 4 + 0.81 * 5, 6 + 0.9 * 7 + 0.81 * 8])
+    assert samples.discounts.ravel().tolist() == pytest.approx([0.9**3] * 3)
+    assert samples.dones.sum() == 0  # a time limit
+
+
+def test_held_for_one_step_it_is_the_same_sac(random_walk_env):
+    kwargs = {"learning_starts_seconds": 1e3, **SMALL}
+    plain, held = (sac_at_rate(random_walk_env(), 0.1, hold_seconds=hold, **kwargs).learn(60) for hold in (None, 0.1))
+    assert (plain.gamma, plain.learning_starts) == (held.gamma, held.learning_starts)
+    rows = np.arange(60)
+    buffers = (plain.replay_buffer, held.replay_buffer)
+    for buffer in buffers:
+        buffer._normalize_obs = lambda obs, env: obs
+    one, other = (buffer._get_samples(rows) for buffer in buffers)
+    for name in ("observations", "actions", "next_observations", "dones", "rewards"):
+        np.testing.assert_allclose(getattr(one, name), getattr(other, name), rtol=1e-6, err_msg=name)
+    np.testing.assert_allclose(other.discounts, plain.gamma, rtol=1e-6)
+
+
+@pytest.mark.parametrize(("hold", "n_rbf"), [(0.1, 1), (0.5, 1), (0.5, 3)])
+def test_holding_changes_no_clock(scripted_env, hold, n_rbf):
+    """20 updates a second over 6 s, of which the first 2 s are random, in primitive steps."""
+    model = sac_at_rate(scripted_env(dt=0.02), 0.02, learning_starts_seconds=2.0, hold_seconds=hold, n_rbf=n_rbf, **SMALL)
+    model.learn(300)
+    assert model.num_timesteps == 300
+    assert model._n_updates == pytest.approx(80, abs=10)
+    assert model.action_space.shape == (n_rbf,)
+    steps = round(hold / 0.02)
+    played = np.array(model.get_env().envs[0].unwrapped.actions[:steps]).ravel()
+    assert len(set(played)) == (1 if n_rbf == 1 else steps)
+    assert model.get_env().env_method("plan", np.ones(n_rbf))[0].ravel().tolist() == pytest.approx([1.0] * steps)
+
+
+def test_a_held_sac_is_saved_and_evaluated(scripted_env, tmp_path):
+    env = scripted_env(dt=0.1, truncate_at=10)
+    model = sac_at_rate(env, 0.1, learning_starts_seconds=0.5, hold_seconds=0.5, **SMALL).learn(40, progress_bar=False)
+    model.save(tmp_path / "model")
+    loaded = SAC.load(tmp_path / "model", device="cpu")
+    episodes = evaluate_discounted_return(
+        loaded, hold_actions(env, 0.5, 1, False, 0.1, DEFAULT_DISCOUNT_RATE), 2, smoothness=True
+    )
+    assert [episode.decisions for episode in episodes] == [2, 2]
+    assert math.isfinite(episodes[0].mean_absolute_jerk)
+
+
+def test_a_learned_duration_and_the_price_of_a_decision(scripted_env):
+    """TaCoS: rewards of 1 a second, and each decision costs 0.05, whatever time it takes; updates follow the time."""
+    kwargs = {"gamma": 0.9, "gamma_dt": 0.1, "learning_starts_seconds": 2.0, "hold_seconds": 0.5, **SMALL}
+    model = sac_at_rate(scripted_env(dt=0.1), 0.1, learned_duration=True, decision_price=0.05, **kwargs).learn(80)
+    assert model.action_space.shape == (2,)
+    buffer = model.replay_buffer
+    n_steps = np.round(buffer.durations[: buffer.size(), 0] / 0.1)
+    assert set(n_steps) == {1, 2, 3, 4, 5}
+    samples = buffer._get_samples(np.arange(buffer.size()))
+    tau = -math.log(0.9) / 0.1
+    price = 0.05 / ((1 - 0.9) / tau)  # in the unit of a reward of 1 over gamma_dt
+    assert samples.rewards.ravel().numpy() == pytest.approx((1 - 0.9**n_steps) / (1 - 0.9) - price, rel=1e-5)
+    assert samples.discounts.ravel().numpy() == pytest.approx(0.9**n_steps, rel=1e-5)
+    assert model._n_updates == pytest.approx(20 * 6, abs=10)
+    # What is measured of an episode knows no price.
+    assert buffer.integrated_rewards[: buffer.size(), 0] == pytest.approx((1 - 0.9**n_steps) / tau, rel=1e-5)
+
+
+def test_learning_goes_on_at_the_same_rate_of_updates(scripted_env):
+    model = sac_at_rate(scripted_env(dt=0.1), 0.1, learning_starts_seconds=1.0, hold_seconds=0.2, **SMALL)
+    assert model.learn(30)._n_updates == pytest.approx(20 * 2, abs=4)
+    assert model.learn(30, reset_num_timesteps=False)._n_updates == pytest.approx(20 * 5, abs=4)
+    assert model.learn(30)._n_updates == pytest.approx(20 * 7, abs=8)
+
+
+def test_pink_noise_stays_on_one_side_for_longer(scripted_env):
+    pytest.importorskip("pink", reason="pink-noise-rl is not installed")
+    lasting = []
+    for pink in (None, 10.0):
+        model = sac_at_rate(scripted_env(dt=0.02), 0.02, pink_noise_seconds=pink, **SMALL)
+        obs = np.zeros((1, 2), dtype=np.float32)
+        actions = np.array([model.predict(obs, deterministic=False)[0] for _ in range(500)]).ravel()
+        noise = actions - actions.mean()
+        lasting.append(float((noise[1:] * noise[:-1]).mean() / noise.var()))
+    assert lasting[0] < 0.2
+    assert lasting[1] > 0.4
+
+
+def test_pink_noise_says_what_it_needs(scripted_env, monkeypatch):
+    monkeypatch.setitem(sys.modules, "pink", None)
+    with pytest.raises(ImportError, match="pip install pink-noise-rl"):
+        sac_at_rate(scripted_env(), 0.1, pink_noise_seconds=1.0, **SMALL)
+
+
 @pytest.mark.parametrize(
     ("kwargs", "error", "message"),
     [
+        ({"hold_seconds": 0.05}, ValueError, "hold_seconds must be None, or at least a step of 0.1 s, not 0.05"),
+        ({"pink_noise_seconds": math.nan}, ValueError, "pink_noise_seconds must be None, or at least"),
+        ({"n_rbf": 3}, ValueError, "n_rbf=3, .* are of decisions that take several steps: pass hold_seconds"),
         ({"dt": 0.0}, ValueError, "dt must be a positive"),
         ({"updates_per_second": 0.0}, ValueError, "updates_per_second must be positive"),
         ({"learning_starts_seconds": -1.0}, ValueError, "learning_starts_seconds must be at least 0"),

@@ -20,9 +20,10 @@ import yaml
 from conftest import PATIENCE
 from rliable.metrics import aggregate_iqm
 
+from sb3_ctco.evaluation import evaluate_discounted_return
 from sb3_ctco.registry import ALGORITHMS as ALGORITHM_ROWS
 from sb3_ctco.registry import TASKS, Task, find_task
-from sb3_ctco.study import agents, engines, plots, runs, status
+from sb3_ctco.study import agents, engines, plots, runs, schedule, status
 from sb3_ctco.study.cli import main
 from sb3_ctco.study.grid import Run, load_preset, preset_names
 from sb3_ctco.study.records import COLUMNS, collect, paper_returns, read_curves, read_records
@@ -76,11 +77,11 @@ def wait_for(condition) -> None:
 
 
 def test_the_presets_are_the_grids_that_they_should_be():
-    assert preset_names() == ["learning", "native", "paper", "quick", "smoke"]
+    assert preset_names() == ["learning", "native", "opponents", "paper", "quick", "smoke", "unseen"]
     paper, quick = load_preset("paper"), load_preset("quick")
     assert len(paper.select(settings=["paper"])) == 30 * 4 * 3 * 4
     assert {run.task_seconds for run in paper.runs} == {400 * 60}
-    assert len(quick.runs) == 5 * 3 * 4
+    assert len(quick.runs) == 6 * 3 * 4
     for preset in (paper, quick):
         assert {run.rate for run in preset.runs} == {50, 100, 250, 500}
         assert {run.task for run in preset.runs} == {"point_mass", "cheetah", "ball_in_cup"}
@@ -103,14 +104,14 @@ def test_the_presets_are_the_grids_that_they_should_be():
 def test_seeds_may_be_others_than_the_presets() -> None:
     quick = load_preset("quick")
     runs = quick.select(tasks=["cheetah"], seeds=[5, 0])
-    assert [run.seed for run in runs] == [5] * 20 + [0] * 20
-    assert runs[20:] == quick.select(tasks=["cheetah"])
-    assert runs[0] == dataclasses.replace(runs[20], seed=5)
+    assert [run.seed for run in runs] == [5] * 24 + [0] * 24
+    assert runs[24:] == quick.select(tasks=["cheetah"])
+    assert runs[0] == dataclasses.replace(runs[24], seed=5)
     with pytest.raises(ValueError, match=r"seeds must not be negative: \[-1\]"):
         quick.select(seeds=[-1])
 
 
-@pytest.mark.parametrize("name", ["smoke", "quick", "paper"])
+@pytest.mark.parametrize("name", ["smoke", "quick", "opponents", "paper", "unseen"])
 def test_every_setting_fits_its_constructor_and_environment(name):
     for run in load_preset(name).runs:
         agents.constructor_arguments(run)
@@ -141,6 +142,30 @@ def test_seconds_become_steps(algorithm, rate):
     assert model.seed == 0
 
 
+@pytest.mark.parametrize(
+    ("setting", "weights", "decisions"),
+    [("20ms", 2, 500), ("25steps", 2, 40), ("100ms", 6, 100), ("price-0.003", 3, None), ("large", 2, 1000)],
+)
+def test_opponents_decide_as_their_settings_say(setting, weights, decisions):
+    """At 100 Hz, on point mass with its two actuators, in episodes of 10 s."""
+    (run, *_) = load_preset("opponents").select(tasks=["point_mass"], rates=[100], settings=[setting])
+    model = agents.make_model(dataclasses.replace(run, arguments={**run.arguments, "buffer_size": 1000}))
+    assert model.action_space.shape == (weights,)
+    assert model.learning_starts == 60 * 100
+    (episode,) = evaluate_discounted_return(model, agents.make_eval_env(run, model), 1, deterministic=False)
+    assert episode.seconds == pytest.approx(10.0)
+    if decisions is not None:
+        assert episode.decisions == decisions
+
+
+def test_an_entry_may_have_rates_of_its_own(tmp_path):
+    preset = load_preset("unseen")
+    assert {run.rate for run in preset.select(algorithms=["sac_repeat"])} == {500}
+    assert {run.rate for run in preset.select(algorithms=["sac"])} == {50, 500}
+    with pytest.raises(ValueError, match=r"algorithm ctco: rates must be a list of whole numbers of Hz, each once, not \[\]"):
+        load_preset(tiny(tmp_path, **of_ctco(rates=[])))
+
+
 def of_ctco(**changes):
     return {"algorithms": {"ctco": {"setting": "a", "arguments": {}, **changes}}}
 
@@ -168,7 +193,10 @@ def of_ctco(**changes):
         ({"algorithms": ["ctco"]}, r"algorithms must be a mapping of names to setting and arguments, not \['ctco'\]"),
         ({"algorithms": {}}, "algorithms must be a mapping of names to setting and arguments, not {}"),
         ({"algorithms": None}, "algorithms must be a mapping of names to setting and arguments, not None"),
-        ({"algorithms": {"ctco": None}}, r"algorithm ctco: must be a mapping with \['setting', 'arguments', 'algorithm'\]"),
+        (
+            {"algorithms": {"ctco": None}},
+            r"must be a mapping with \['setting', 'arguments', 'algorithm', 'rates'\]",
+        ),
         (of_ctco(arguments=None), "arguments must be a mapping of names to values .* not None"),
         (of_ctco(arguments=[1]), r"arguments must be a mapping of names to values .* not \[1\]"),
         (of_ctco(arguments={3: 1}), r"arguments must be a mapping of names to values .* not \{3: 1\}"),
@@ -229,11 +257,15 @@ def test_mistakes_on_the_command_line(tmp_path, capsys):
     for arguments, message in [
         (
             ["run", "--preset", "none"],
-            "no preset 'none': name one of ['learning', 'native', 'paper', 'quick', 'smoke'], or a YAML file",
+            f"no preset 'none': name one of {preset_names()}, or a YAML file",
         ),
         (["run", "--preset", "quick", "--rates", "60"], "preset quick has no rate [60]; it has [50, 100, 250, 500]"),
         (["run", "--preset", preset], "ctco (a) has no arguments ['gama']"),
         (["run", "--preset", preset, "--workers", "0"], "--workers must be at least 1, not 0"),
+        (
+            ["run", "--preset", preset, "--hours", "0"],
+            "--hours must be positive and is for --engine local, not 0.0 with local",
+        ),
         (["run", "--preset", preset, "--address", "auto"], "--address auto is Ray's: add --engine ray"),
         (["status", str(tmp_path)], "is no folder of a study"),
         (["plot", str(tmp_path)], "no run in"),
@@ -732,6 +764,91 @@ def test_status_estimates_the_time_left(finished, tmp_path, capsys):
     assert capsys.readouterr().out == (
         "1 of 2 runs done, 1 running, 1 h 30 min left\nrunning point_mass-ctco_small-50hz-seed1: 25 %, return 1.00\n"
     )
+
+
+def recorded(task, algorithm, rate, seconds, setting="large"):
+    """What a plan reads of a record: ``seconds`` of wall time for 1,000 s of task time."""
+    return {
+        "task": task,
+        "algorithm": algorithm,
+        "setting": setting,
+        "dt": 1 / rate,
+        "task_seconds": 1000.0,
+        "wall_seconds": seconds,
+    }
+
+
+def test_what_runs_are_expected_to_take():
+    quick = load_preset("quick")
+
+    def cost(task, algorithm, rate, setting, *sources):
+        (run,) = quick.select([task], [rate], [algorithm], [setting])
+        return schedule.costs([run], *sources)[run.name] / 2400  # s a second of task time
+
+    here = [recorded("cheetah", "sac", 500, 900.0), recorded("cheetah", "sac", 500, 700.0)]
+    there = [
+        recorded("cheetah", "sac", 500, 5000.0),
+        recorded("point_mass", "sac", 500, 300.0),
+        recorded("cheetah", "ctco", 500, 100.0, "tuned"),
+    ]
+    assert cost("cheetah", "sac", 500, "large", here, there) == pytest.approx(0.8)  # this machine's, of the same kind
+    assert cost("cheetah", "sac", 500, "large", there) == pytest.approx(5.0)
+    assert cost("ball_in_cup", "sac", 500, "large", there) == pytest.approx(2.65)  # other tasks
+    assert cost("cheetah", "ctco", 500, "paper", here, there) == pytest.approx(0.1)  # another setting
+    assert cost("cheetah", "dac_ppo", 500, "large", there) == pytest.approx(5.0)  # the dearest at its rate
+    assert cost("cheetah", "dac_ppo", 50, "large", there) == pytest.approx(5.0)  # the dearest of all
+    assert cost("cheetah", "dac_ppo", 50, "large") == schedule.UNKNOWN
+
+
+def test_the_plan_is_seed_by_seed_and_the_cheap_first_and_ends_in_time():
+    runs = load_preset("quick").select(["cheetah"], [50, 500], ["ctco", "sac"], ["tuned", "large"], seeds=[0, 1])
+    hours = {("ctco", 50): 1.0, ("ctco", 500): 2.0, ("sac", 50): 3.0, ("sac", 500): 9.0}
+    cost = {run.name: hours[run.algorithm, run.rate] for run in runs}
+
+    def plan(workers, seconds):
+        return [(begin, run.seed, run.algorithm, run.rate) for begin, run in schedule.fit(runs, cost, workers, seconds)]
+
+    # One process and ten hours: seed 0 but for the run of nine hours, and of seed 1 what fits in.
+    assert plan(1, 10.0) == [
+        (0, 0, "ctco", 50),
+        (1, 0, "ctco", 500),
+        (3, 0, "sac", 50),
+        (6, 1, "ctco", 50),
+        (7, 1, "ctco", 500),
+    ]
+    assert len(plan(1, 30.0)) == len(runs)
+    # Two: the second begins with the second, and the first is free again for the third.
+    assert plan(2, 4.0) == [(0, 0, "ctco", 50), (0, 0, "ctco", 500), (1, 0, "sac", 50), (2, 1, "ctco", 50)]
+
+
+def test_hours_make_what_fits_and_leave_the_rest(finished, tmp_path, capsys):
+    preset, folder = finished
+    collect([folder], tmp_path / "costs.csv")
+    rows = list(csv.DictReader((tmp_path / "costs.csv").open()))
+    for row in rows:
+        row["wall_seconds"] = 3000
+    with (tmp_path / "costs.csv").open("w", newline="") as file:
+        writer = csv.DictWriter(file, list(rows[0]))
+        writer.writeheader()
+        writer.writerows(rows)
+    study = tmp_path / "study"
+    command = ["run", "--preset", preset, "--folder", str(study), "--workers", "1", "--costs", str(tmp_path / "costs.csv")]
+    assert main([*command, "--hours", "1"]) == 0
+    output = capsys.readouterr().out
+    assert "1 of 2 runs fit into 1 h on 1 processes (0.8 h in all):" in output
+    assert "  after 0 min: point_mass-ctco_small-50hz-seed0, 50 min" in output
+    assert [record["seed"] for record in read_records(study)] == [0]
+    # What the first took is known by then, and the second fits.
+    assert main([*command, "--hours", "1"]) == 0
+    assert [record["seed"] for record in read_records(study)] == [0, 1]
+
+
+def test_a_run_that_cannot_end_any_more_is_not_begun(finished, tmp_path):
+    preset, _ = finished
+    runs_ = load_preset(preset).runs
+    runs.plan(runs_, tmp_path)
+    outcomes = list(engines.run_local(runs_, tmp_path, 1, may_begin=lambda run: run.seed == 1))
+    assert [(outcome.name, outcome.state) for outcome in outcomes] == [(runs_[1].name, "done")]
 
 
 @pytest.mark.slow

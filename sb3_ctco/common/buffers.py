@@ -1,7 +1,8 @@
 """Replay buffers for options: Stable-Baselines3's, extended by the duration and the integrated reward of a decision."""
 
 import dataclasses
-from typing import Any
+import math
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 import torch as th
@@ -10,15 +11,44 @@ from stable_baselines3.common.buffers import DictReplayBuffer, ReplayBuffer
 from stable_baselines3.common.type_aliases import DictReplayBufferSamples, ReplayBufferSamples
 from stable_baselines3.common.vec_env import VecNormalize
 
-from sb3_ctco.options import DEFAULT_DISCOUNT_RATE, SubOptions, discount
+from sb3_ctco.options import (
+    DEFAULT_DISCOUNT_RATE,
+    REWARD_UNITS,
+    ActionBox,
+    OptionSpace,
+    RewardUnit,
+    Stacked,
+    SubOptions,
+    discount,
+    rows_of,
+    shortest_steps,
+    sub_options,
+)
 from sb3_ctco.vec_env import PENDING
+
+
+class AddedTrajectory(NamedTuple):
+    """What became of a recorded trajectory, see :meth:`OptionReplayBuffer.add_trajectory`.
+
+    :param added: how many of its stretches were stored as options
+    :param refused: how many were not, because no option plays their actions within the tolerance
+    :param largest_residual: the largest deviation of a stored option's actions from those that were recorded, normalised
+    """
+
+    added: int
+    refused: int
+    largest_residual: float
 
 
 class _OptionStorage(ReplayBuffer):
     """What the two option buffers add to their Stable-Baselines3 base."""
 
-    #: Of buffers that were saved without one
-    reward_scale = 1.0
+    #: Of buffers that were saved without these
+    reward_scale: float | Literal["auto"] = 1.0
+    demonstration_fraction = 0.5
+    n_demonstrations = 0
+    option_space: OptionSpace | None = None
+    primitive_action_space: spaces.Box | None = None
 
     def __init__(
         self,
@@ -30,8 +60,13 @@ class _OptionStorage(ReplayBuffer):
         optimize_memory_usage: bool = False,
         handle_timeout_termination: bool = True,
         discount_rate: float = DEFAULT_DISCOUNT_RATE,
-        reward_scale: float = 1.0,
+        reward_scale: float | Literal["auto"] = 1.0,
+        demonstration_fraction: float = 0.5,
+        option_space: OptionSpace | None = None,
+        primitive_action_space: spaces.Box | None = None,
     ):
+        if not 0.0 <= demonstration_fraction <= 1.0:
+            raise ValueError(f"demonstration_fraction must be a part of each batch, in [0, 1], not {demonstration_fraction}")
         if optimize_memory_usage:
             raise ValueError(
                 f"{type(self).__name__} does not support optimize_memory_usage=True: it would lose the observation "
@@ -48,7 +83,12 @@ class _OptionStorage(ReplayBuffer):
             handle_timeout_termination=handle_timeout_termination,
         )
         self.discount_rate = float(discount_rate)
-        self.reward_scale = float(reward_scale)
+        self.reward_scale = reward_scale
+        self.demonstration_fraction = float(demonstration_fraction)
+        self.option_space = option_space
+        self.primitive_action_space = primitive_action_space
+        #: How many options of recorded trajectories there are: the last rows, which nothing overwrites
+        self.n_demonstrations = 0
         self.durations = np.zeros((self.buffer_size, self.n_envs), dtype=np.float32)
         self.integrated_rewards = np.zeros((self.buffer_size, self.n_envs), dtype=np.float32)
         #: How many decisions were ever added (without sub-options), and how long their options took, in s.
@@ -114,17 +154,137 @@ class _OptionStorage(ReplayBuffer):
             )
             self.durations[position] = option["duration"]
             self.integrated_rewards[position] = option["integrated_reward"]
+            self._move_to(position + 1)
             self.n_decisions += 1
             self.decision_seconds += option["duration"]
             if i in sub_options:
                 self._add_sub_options(sub_options[i])
 
+    def add_trajectory(
+        self,
+        observations: Stacked,
+        actions: np.ndarray,
+        rewards: np.ndarray,
+        terminated: bool,
+        truncated: bool,
+        dt: float,
+        *,
+        n_stretches: int = 1,
+        tolerance: float = 0.1,
+        reward_unit: RewardUnit = "rate",
+    ) -> AddedTrajectory:
+        """Store stretches of a trajectory of primitive actions, whoever chose them, as options.
+
+        From each of its steps on, random stretches of d_min to d_max, and at most to its end, are fitted as sub-options are
+        (:func:`~sb3_ctco.options.sub_options`). They are demonstrations: nothing overwrites them, and
+        ``demonstration_fraction`` of each batch is drawn from them. Nothing is stored if anything is wrong.
+
+        Options are in seconds, so the trajectory may have been recorded at another rate than the environment's. A stretch
+        is of whole recorded steps: where these are longer than d_min, no option is shorter than one of them.
+
+        :param observations: ``[n + 1, *observation_shape]``, in the end the one after the last action; or a dictionary of such
+        :param actions: in the units of the environment, ``[n, *action_shape]``
+        :param rewards: ``[n]``
+        :param terminated: whether the episode terminated with the last action
+        :param truncated: whether it was truncated with it
+        :param dt: time from one action to the next, in s
+        :param n_stretches: how many begin at each step; those that would be too short at its end are left out
+        :param tolerance: refuse a stretch if its option's actions deviate by more from those recorded; actions count as
+            normalised to [−1, 1]. Noisy actions of a fixed rate fit no option of more than n_rbf steps well
+        :param reward_unit: ``"rate"`` or ``"impulse"``, see :func:`~sb3_ctco.options.integrated_reward`
+        :raises ValueError: if a number is out of range or not finite, a shape is wrong, ``dt`` fits no option, the buffer
+            does not know what options mean, or its rows do not suffice
+        """
+        if self.option_space is None or self.primitive_action_space is None:
+            raise ValueError(
+                "this buffer does not know what options mean: add to the replay_buffer of a model that has an environment, or "
+                f"pass option_space and primitive_action_space (of OptionExecutionWrapper) to {type(self).__name__}"
+            )
+        if not (dt > 0 and math.isfinite(dt)):
+            raise ValueError(f"dt must be a positive number of seconds, not {dt}")
+        if n_stretches < 1 or not tolerance >= 0 or reward_unit not in REWARD_UNITS:
+            raise ValueError(
+                f"n_stretches must be at least 1, tolerance at least 0, and reward_unit one of {REWARD_UNITS}, not "
+                f"{n_stretches}, {tolerance} and {reward_unit!r}"
+            )
+        space = dataclasses.replace(self.option_space, dt=dt)
+        shortest, longest = shortest_steps(space), math.floor(space.d_max / dt + 1e-6)
+        if longest < shortest:
+            raise ValueError(
+                f"no whole number of steps of dt={dt} s is as long as an option, {space.d_min} to {space.d_max} s: record at "
+                "a higher rate, or use a model with a larger d_max"
+            )
+        rewards = np.asarray(rewards, dtype=np.float64)
+        plan = ActionBox(self.primitive_action_space.low, self.primitive_action_space.high).normalise(actions)
+        seen = _recorded(observations, self.observation_space)
+        _check_recorded(seen, plan, rewards)
+
+        n_steps = len(rewards)
+        firsts = np.arange(n_steps).repeat(n_stretches)
+        ends = np.minimum(firsts + np.random.randint(shortest, longest + 1, len(firsts)), n_steps)
+        long_enough = ends - firsts >= shortest
+        firsts, ends = firsts[long_enough], ends[long_enough]
+        parts = []
+        # In windows, since R is computed from rewards that are discounted from a window's beginning.
+        for first, end in ((k, min(k + 2 * longest, n_steps)) for k in range(0, n_steps, longest)):
+            begun = slice(*firsts.searchsorted([first, first + longest]))
+            stretches = list(zip((firsts[begun] - first).tolist(), (ends[begun] - first).tolist(), strict=True))
+            window, rows = slice(first, end), slice(first, end + 1)
+            played = (plan[window], rewards[window], stretches, list(range(end - first + 1)), rows_of(seen, rows))
+            ended = (terminated and end == n_steps, truncated and end == n_steps)
+            parts.append(sub_options(space, *played, *ended, reward_unit, tolerance))
+        added = sum(map(len, parts))
+        if self.n_demonstrations + added >= self.buffer_size:
+            raise ValueError(
+                f"{added} options of this trajectory and {self.n_demonstrations} that are there leave no row for what the "
+                f"policy does: buffer_size={self.buffer_size} must be larger, or n_stretches={n_stretches} smaller"
+            )
+        for part in parts:
+            self.n_demonstrations += len(part)
+            row = self.buffer_size - self.n_demonstrations
+            self._write(slice(row, row + len(part)), part)
+        self._move_to(self.pos)
+        residuals = np.concatenate([part.residuals for part in parts])
+        return AddedTrajectory(added, len(firsts) - added, float(residuals.max(initial=0.0)))
+
+    def size(self) -> int:
+        """How many transitions there are, demonstrations included."""
+        return self._n_experienced + self.n_demonstrations
+
+    @property
+    def _n_experienced(self) -> int:
+        """Rows of what the policy did, the first ones."""
+        return self.buffer_size - self.n_demonstrations if self.full else self.pos
+
+    def sample(self, batch_size: int, env: VecNormalize | None = None) -> Any:
+        """Stable-Baselines3's ``sample``, with ``demonstration_fraction`` of the batch from demonstrations, if there are any.
+
+        :param batch_size: number of transitions
+        :param env: normalises observations
+        """
+        if not self.n_demonstrations:
+            return super().sample(batch_size, env)
+        first = self.buffer_size - self.n_demonstrations
+        count = round(self.demonstration_fraction * batch_size) if self._n_experienced else batch_size
+        demonstrated = np.random.randint(first, self.buffer_size, count)
+        experienced = np.random.randint(0, max(self._n_experienced, 1), batch_size - count)
+        return self._get_samples(np.concatenate([demonstrated, experienced]), env)
+
+    def _move_to(self, position: int) -> None:
+        """Where the next transition goes, at the ring's beginning again after its end."""
+        n_rows = self.buffer_size - self.n_demonstrations
+        self.full = self.full or position >= n_rows
+        self.pos = position % n_rows
+
     def _add_sub_options(self, sub_options: SubOptions) -> None:
+        end, n_rows = self.pos + len(sub_options), self.buffer_size - self.n_demonstrations
+        self._write(slice(self.pos, end) if end <= n_rows else np.arange(self.pos, end) % n_rows, sub_options)
+        self._move_to(end)
+
+    def _write(self, rows: slice | np.ndarray, sub_options: SubOptions) -> None:
         count = len(sub_options)
         if count == 0:
             return
-        end = self.pos + count
-        rows = slice(self.pos, end) if end <= self.buffer_size else np.arange(self.pos, end) % self.buffer_size
         values: Any
         for stored, values in (
             (self.observations, sub_options.observations),
@@ -142,8 +302,6 @@ class _OptionStorage(ReplayBuffer):
         self.durations[rows, 0] = sub_options.durations
         self.dones[rows, 0] = sub_options.terminated | sub_options.truncated
         self.timeouts[rows, 0] = sub_options.truncated & self.handle_timeout_termination
-        self.full = self.full or end >= self.buffer_size
-        self.pos = end % self.buffer_size
 
     def _sample_fields(self, batch_inds: np.ndarray, env: VecNormalize | None) -> dict[str, Any]:
         # ReplayBuffer._get_samples of Stable-Baselines3 2.9 has no place for further fields, so it is written anew.
@@ -162,9 +320,20 @@ class _OptionStorage(ReplayBuffer):
             "actions": self._tensor(rows(self.actions)),
             "next_observations": observations(self.next_observations),
             "dones": self._tensor(dones[:, None]),
-            "rewards": self._tensor(rows(self.integrated_rewards)[:, None]) * self.reward_scale,
+            "rewards": self._tensor(rows(self.integrated_rewards)[:, None]) * self._found_reward_scale(),
             "discounts": self._tensor(discount(rows(self.durations), self.discount_rate)[:, None]),
         }
+
+    def _found_reward_scale(self) -> float:
+        if self.reward_scale != "auto":
+            return self.reward_scale
+        paid = self.integrated_rewards != 0
+        if not paid.any():
+            return 1.0  # Nothing was paid so far, so every scale is the same.
+        # Without a discount, forever is 100 s.
+        forever = np.abs(self.integrated_rewards[paid]) / -np.expm1(-max(self.discount_rate, 0.01) * self.durations[paid])
+        self.reward_scale = 100.0 / float(forever.max())
+        return self.reward_scale
 
     def _tensor(self, array: np.ndarray) -> th.Tensor:
         return th.from_numpy(array).to(self.device)
@@ -203,6 +372,47 @@ def _matching(seen: np.ndarray, first: np.ndarray, last: np.ndarray | None) -> n
     raise _not_seen(f"{seen[0]} (shape {seen.shape[1:]})", f"{first} (shape {np.shape(first)})")
 
 
+def _recorded(observations: Any, space: spaces.Space) -> Stacked:
+    """Recorded observations, stacked, as a buffer for this space stores them.
+
+    :raises ValueError: if they have other shapes, or are not finite
+    """
+    if isinstance(space, spaces.Dict):
+        if not isinstance(observations, dict) or observations.keys() != space.spaces.keys():
+            raise ValueError(f"observations must be a dictionary of {sorted(space.spaces)}, not {_described(observations)}")
+        return {key: _recorded(observations[key], inner) for key, inner in space.spaces.items()}  # type: ignore[misc]
+    stacked = np.asarray(observations)
+    if stacked.ndim == 4 and stacked.shape[1:] != space.shape:
+        stacked = np.moveaxis(stacked, -1, 1)  # pictures as they are recorded, where VecTransposeImage turns them
+    if stacked.shape[1:] != space.shape:
+        raise ValueError(f"observations must have shape [n + 1, *{space.shape}], not {np.shape(observations)}")
+    if not np.isfinite(stacked).all():
+        raise ValueError("observations must be finite, and these are not: leave out the steps where a sensor failed")
+    return stacked
+
+
+def _check_recorded(seen: Stacked, plan: np.ndarray, rewards: np.ndarray) -> None:
+    """Refuse a recorded trajectory whose parts do not fit together.
+
+    :param seen: observations, stacked
+    :param plan: actions, normalised, ``[n, action_dim]``
+    """
+    n_seen = {len(leaf) for leaf in (seen.values() if isinstance(seen, dict) else [seen])}
+    if rewards.ndim != 1 or len(rewards) == 0 or len(plan) != len(rewards) or n_seen != {len(rewards) + 1}:
+        raise ValueError(
+            f"a trajectory has n actions, n rewards and n + 1 observations, the last one of after the last action, not "
+            f"{len(plan)} actions, rewards of shape {rewards.shape} and {sorted(n_seen)} observations"
+        )
+    if not np.isfinite(rewards).all():
+        raise ValueError(f"rewards must be finite, not {rewards}")
+    # Single precision rounds past a bound.
+    if not (np.abs(plan) <= 1.0 + 1e-4).all():
+        raise ValueError(
+            f"actions must be finite and within the environment's bounds, and normalised to [−1, 1] by these they go from "
+            f"{plan.min()} to {plan.max()}: convert their units, clip them, or widen the bounds"
+        )
+
+
 def _described(obs: Any) -> str:
     return f"a dictionary of {sorted(obs)}" if isinstance(obs, dict) else f"an array of shape {np.shape(obs)}"
 
@@ -224,8 +434,12 @@ class OptionReplayBuffer(_OptionStorage):
     and an environment wrapped in :class:`~sb3_ctco.wrappers.OptionExecutionWrapper` they learn on the semi-Markov process.
 
     :param discount_rate: τ, in 1/s; the wrapper's
-    :param reward_scale: what R is multiplied by in samples; ``1/step_weight(dt, discount_rate)`` gives R the unit of a reward
-        of 1 over ``dt``, so that an option of one step is worth to a stock algorithm what a step is
+    :param reward_scale: what R is multiplied by in samples. ``"auto"`` finds it at the first sample after something was paid,
+        and keeps it: the best (or worst) option so far, R/(1 − γ(d)) if it were repeated forever, is worth 100. That does not
+        depend on the unit of rewards, and it is what a reward of 1 a step is worth to SAC with its usual discount of 0.99
+    :param demonstration_fraction: part of each batch that is drawn from what ``add_trajectory`` stored, if that is anything
+    :param option_space: what options mean, for ``add_trajectory``; CTCO and FiGAR-SAC tell their buffer
+    :param primitive_action_space: the action space of the bare environment, likewise
     :raises ValueError: if ``optimize_memory_usage`` is asked for
     """
 

@@ -44,7 +44,7 @@ from sb3_ctco.common.buffers import DictOptionReplayBuffer, OptionReplayBuffer
 from sb3_ctco.common.callbacks import OptionProgressBarCallback, PrimitiveStepCallback, eval_callbacks
 from sb3_ctco.common.load_arguments import check_load_arguments
 from sb3_ctco.option_array import OptionArray
-from sb3_ctco.options import DurationScale, OptionSpace, Trajectory, discount_rate_from_gamma, step_weight
+from sb3_ctco.options import DurationScale, Join, OptionSpace, Trajectory, discount_rate_from_gamma
 from sb3_ctco.vec_env import PLAYED, AsyncOptionVecEnv
 from sb3_ctco.wrappers import OptionExecutionWrapper, find_dt
 
@@ -63,12 +63,14 @@ class OptionOffPolicyAlgorithm(OffPolicyAlgorithm):
 
     :param n_rbf: number of radial basis functions an action dimension
     :param d_max: longest duration of an option, in s
-    :param d_min: shortest duration, in s; by default one step of the environment
+    :param d_min: shortest duration, in s, and never less than one step of the environment; by default what
+        ``OptionExecutionWrapper`` has
     :param dt: the environment's interaction period, in s; by default found in the environment
     :param trajectory: how ω becomes actions, a name in ``sb3_ctco.options.TRAJECTORIES`` or a class
     :param duration_scale: ``"log"`` or ``"linear"``, see :class:`~sb3_ctco.options.OptionSpace`
-    :param reward_scale: what R is multiplied by for the critics, or ``"gamma_dt"`` for the unit of a reward of 1 over
-        ``gamma_dt``
+    :param join: ``"free"`` or ``"continuous"``, see :class:`~sb3_ctco.wrappers.OptionExecutionWrapper`
+    :param reward_scale: what R is multiplied by for the critics, or ``"auto"``, see
+        :class:`~sb3_ctco.common.buffers.OptionReplayBuffer`
     :param gamma: discount factor over ``gamma_dt`` seconds, in (0, 1]
     :param gamma_dt: in s
     :param train_freq: collect at least this many primitive steps (in each environment) between trainings
@@ -87,6 +89,7 @@ class OptionOffPolicyAlgorithm(OffPolicyAlgorithm):
         "d_min",
         "trajectory",
         "duration_scale",
+        "join",
         "reward_scale",
         "canonical_weights",
         "n_repetitions",
@@ -98,7 +101,7 @@ class OptionOffPolicyAlgorithm(OffPolicyAlgorithm):
     _own_setting: ClassVar[str] = "discount_rate"
 
     #: Of arguments that older files do not have: what their networks were trained with
-    _before_it_was_saved: ClassVar[dict[str, Any]] = {"duration_scale": "linear", "reward_scale": 1.0}
+    _before_it_was_saved: ClassVar[dict[str, Any]] = {"duration_scale": "linear", "join": "free", "reward_scale": 1.0}
 
     def __init__(
         self,
@@ -112,7 +115,8 @@ class OptionOffPolicyAlgorithm(OffPolicyAlgorithm):
         dt: float | None,
         trajectory: str | type[Trajectory] = "rbf",
         duration_scale: DurationScale = "linear",
-        reward_scale: float | Literal["gamma_dt"] = 1.0,
+        join: Join = "free",
+        reward_scale: float | Literal["auto"] = 1.0,
         gamma: float,
         gamma_dt: float,
         updates_per_second: float | None,
@@ -127,15 +131,16 @@ class OptionOffPolicyAlgorithm(OffPolicyAlgorithm):
         self.dt = dt
         self.trajectory = trajectory
         self.duration_scale: DurationScale = duration_scale
-        self.reward_scale: float | Literal["gamma_dt"] = reward_scale
+        self.join: Join = join
+        self.reward_scale: float | Literal["auto"] = reward_scale
         self.gamma = gamma
         self.gamma_dt = gamma_dt
         # An explicit dt stays the user's word on any environment; one that was found must be found again.
         self._dt_was_given = dt is not None
         #: τ, in 1/s
         self.discount_rate = discount_rate_from_gamma(gamma, gamma_dt)
-        if reward_scale != "gamma_dt" and not (isinstance(reward_scale, int | float) and 0 < reward_scale < math.inf):
-            raise ValueError(f"reward_scale must be a positive number or 'gamma_dt', not {reward_scale!r}")
+        if reward_scale != "auto" and not (isinstance(reward_scale, int | float) and 0 < reward_scale < math.inf):
+            raise ValueError(f"reward_scale must be a positive number or 'auto', not {reward_scale!r}")
         if updates_per_second is not None:
             if gradient_steps != -1:
                 raise ValueError(
@@ -178,12 +183,12 @@ class OptionOffPolicyAlgorithm(OffPolicyAlgorithm):
                 f"dt={self.dt} s and d_min={self.d_min} s are found in an environment, and {type(self).__name__} has not "
                 "had one: pass it env, or dt and d_min"
             )
-        return OptionSpace.make(**{**self._option_arguments, "dt": self.dt, "d_min": self.d_min})
+        return OptionSpace.make(**{**self._option_arguments, "dt": self.dt, "d_min": max(self.d_min, self.dt)})
 
     @property
     def _option_arguments(self) -> dict[str, Any]:
         """OptionExecutionWrapper's arguments for the same options, ``dt`` and ``d_min`` as far as they are known."""
-        names = ("n_rbf", "d_max", "d_min", "dt", "trajectory", "duration_scale", "discount_rate")
+        names = ("n_rbf", "d_max", "d_min", "dt", "trajectory", "duration_scale", "join", "discount_rate")
         return {name: getattr(self, name) for name in names}
 
     @classmethod
@@ -192,7 +197,7 @@ class OptionOffPolicyAlgorithm(OffPolicyAlgorithm):
 
         :param arguments: the algorithm's arguments, defaults included
         """
-        names = ("n_rbf", "d_max", "d_min", "dt", "trajectory", "duration_scale", "n_sub_options")
+        names = ("n_rbf", "d_max", "d_min", "dt", "trajectory", "duration_scale", "join", "n_sub_options")
         kwargs = {name: arguments[name] for name in names if name in arguments}
         return {**kwargs, "discount_rate": discount_rate_from_gamma(arguments["gamma"], arguments["gamma_dt"])}
 
@@ -274,6 +279,8 @@ class OptionOffPolicyAlgorithm(OffPolicyAlgorithm):
         """The options' settings of an environment, once options mean the same in it as to the algorithm."""
         settings: list[OptionSpace] = env.get_attr("option_space")
         known = {name: value for name, value in self._option_arguments.items() if value is not None}
+        if self.d_min is not None:
+            known["d_min"] = max(self.d_min, settings[0].dt)  # as the wrapper has it
         expected = OptionSpace.make(**{**settings[0].arguments, **known})
         for one in settings:
             for name, (value, found) in expected.differences(one).items():
@@ -298,6 +305,7 @@ class OptionOffPolicyAlgorithm(OffPolicyAlgorithm):
         env = self._wrap_env(self._as_option_env(env), self.verbose)
         self._check_env(env)
         super().set_env(env, force_reset)
+        self._tell_buffer()
 
     @classmethod
     def load(
@@ -371,17 +379,23 @@ class OptionOffPolicyAlgorithm(OffPolicyAlgorithm):
             )
         # Once more, since load may have changed gamma.
         self.discount_rate = discount_rate_from_gamma(self.gamma, self.gamma_dt)
-        scale = 1.0 / step_weight(self.gamma_dt, self.discount_rate) if self.reward_scale == "gamma_dt" else self.reward_scale
-        self.replay_buffer_kwargs = {
-            **self.replay_buffer_kwargs,
-            "discount_rate": self.discount_rate,
-            "reward_scale": scale,
-        }
+        kwargs = {**self.replay_buffer_kwargs, "discount_rate": self.discount_rate}
+        if self.reward_scale != "auto":
+            kwargs["reward_scale"] = self.reward_scale
+        # What "auto" found stays, since critics learned with it.
+        self.replay_buffer_kwargs = {"reward_scale": "auto", **kwargs}
         if self.env is not None:
             settings = self._check_env(self.env)
             self.dt, self.d_min = settings.dt, settings.d_min
         super()._setup_model()
+        self._tell_buffer()
         self._warn_of_a_large_buffer()
+
+    def _tell_buffer(self) -> None:
+        """Tell the replay buffer what options mean, for the trajectories that are added to it."""
+        buffer = self.replay_buffer
+        if isinstance(buffer, OptionReplayBuffer | DictOptionReplayBuffer) and None not in (self.dt, self.d_min):
+            buffer.option_space, buffer.primitive_action_space = self.option_space, self.primitive_action_space
 
     def _warn_of_a_large_buffer(self) -> None:
         buffer, available = self.replay_buffer, _available_memory()
@@ -414,6 +428,7 @@ class OptionOffPolicyAlgorithm(OffPolicyAlgorithm):
                 f"discount_rate={self.discount_rate}: load it into a model with the same gamma and gamma_dt"
             )
         buffer.reward_scale = self.replay_buffer_kwargs["reward_scale"]
+        self._tell_buffer()
 
     def _init_callback(self, callback: MaybeCallback, progress_bar: bool = False) -> BaseCallback:
         if isinstance(callback, list):

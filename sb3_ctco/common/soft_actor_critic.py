@@ -152,6 +152,7 @@ class SoftOptionActorCritic(OptionOffPolicyAlgorithm):
                 losses.append(update(self.replay_buffer.sample(batch_size, env=self._vec_normalize_env)))
 
         self._n_updates += gradient_steps
+        self.replay_buffer_kwargs["reward_scale"] = self.replay_buffer.reward_scale  # type: ignore[attr-defined]
         # Read once, because each reading waits for the device.
         pi_loss_mean, q_loss_mean, ent_coef_loss_mean = th.stack(losses).mean(dim=0).tolist()
         ent_coef, duration_ent_coef = self.ent_coefs.tolist()

@@ -7,11 +7,26 @@ from typing import Any, Literal
 import numpy as np
 import numpy.typing as npt
 
-from sb3_ctco.options.semi_mdp import FloatArray, steps_in
+from sb3_ctco.options.semi_mdp import DEFAULT_DISCOUNT_RATE, FloatArray, steps_in
 from sb3_ctco.options.trajectory import TRAJECTORIES, Trajectory
 
 DurationScale = Literal["log", "linear"]
 DURATION_SCALES: tuple[DurationScale, ...] = ("log", "linear")
+Join = Literal["free", "continuous"]
+JOINS: tuple[Join, ...] = ("free", "continuous")
+
+
+def default_durations(discount_rate: float) -> tuple[float, float]:
+    """The shortest and the longest duration where none is given, in s: a hundredth and a fifth of the horizon 1/τ.
+
+    An agent that decides much more often than that drowns its own exploration, and one of a fixed rate with the usual discount
+    of 0.99 a step decides just that often. The horizon counts as 2.475 s at most, that of the paper's discount of 0.98 over
+    0.05 s: 0.025 and 0.495 s.
+
+    :param discount_rate: τ, in 1/s
+    """
+    horizon = 1.0 / max(discount_rate, DEFAULT_DISCOUNT_RATE)
+    return 0.01 * horizon, 0.2 * horizon
 
 
 @dataclass(frozen=True)
@@ -27,6 +42,8 @@ class OptionSpace:
     :param discount_rate: τ, in 1/s
     :param duration_scale: how [−1, 1] maps to [d_min, d_max]: ``"linear"`` is the paper's, with ``"log"`` equal steps
         multiply the duration, so that short ones are as easy to tell apart as long ones whatever ``d_max`` is
+    :param join: where an option's actions begin: ``"free"``, wherever its weights say, or ``"continuous"``, at the action that
+        is being sent when it begins
     :raises ValueError: if a setting is out of its range
     """
 
@@ -36,6 +53,7 @@ class OptionSpace:
     dt: float
     discount_rate: float
     duration_scale: DurationScale = "linear"
+    join: Join = "free"
 
     def __post_init__(self) -> None:
         for name in ("dt", "d_max", "d_min"):
@@ -45,12 +63,14 @@ class OptionSpace:
         if self.d_min > self.d_max:
             raise ValueError(
                 f"d_min={self.d_min} s is longer than d_max={self.d_max} s: "
-                "raise d_max, or pass a d_min (by default one step, dt) that is at most d_max"
+                f"raise d_max, or pass a smaller d_min (an option takes one step, dt={self.dt} s, or more)"
             )
         if not (self.discount_rate >= 0 and math.isfinite(self.discount_rate)):
             raise ValueError(f"discount_rate must be a finite number of 1/s that is at least 0, not {self.discount_rate}")
         if self.duration_scale not in DURATION_SCALES:
             raise ValueError(f"duration_scale must be one of {DURATION_SCALES}, not {self.duration_scale!r}")
+        if self.join not in JOINS:
+            raise ValueError(f"join must be one of {JOINS}, not {self.join!r}")
 
     @classmethod
     def make(
@@ -62,6 +82,7 @@ class OptionSpace:
         discount_rate: float,
         trajectory: str | type[Trajectory] = "rbf",
         duration_scale: DurationScale = "linear",
+        join: Join = "free",
     ) -> "OptionSpace":
         """An option space from the arguments that wrappers and algorithms take.
 
@@ -72,7 +93,12 @@ class OptionSpace:
             if trajectory not in TRAJECTORIES:
                 raise ValueError(f"trajectory must be one of {list(TRAJECTORIES)} or a Trajectory class, not {trajectory!r}")
             trajectory = TRAJECTORIES[trajectory]
-        return cls(trajectory(n_rbf), d_max, d_min, dt, discount_rate, duration_scale)
+        return cls(trajectory(n_rbf), d_max, d_min, dt, discount_rate, duration_scale, join)
+
+    @property
+    def joined(self) -> bool:
+        """Whether an option leaves from the action that is being sent when it begins."""
+        return self.join == "continuous"
 
     @property
     def arguments(self) -> dict[str, Any]:
@@ -131,10 +157,30 @@ class OptionSpace:
         """
         return option[:-1].reshape(-1, self.trajectory.n_weights), steps_in(self.duration(option), self.dt)
 
-    def plan(self, option: FloatArray) -> FloatArray:
-        """All actions of an option, normalised: shape ``[n_steps, action_dim]``."""
+    def stretch(self, plan: FloatArray, first: int, end: int, before: FloatArray | None = None) -> tuple[FloatArray, float]:
+        """The option that comes closest to a stretch of a plan.
+
+        :param plan: normalised actions, shape ``[n_steps, action_dim]``
+        :param first: the first step of the stretch
+        :param end: the step after its last
+        :param before: with a continuous join the action from which the plan leaves, normalised
+        :return: the option vector, float32, and the largest deviation of its actions from the plan
+        """
+        omega, residuals = self.trajectory.fit(plan, np.array([first]), np.array([end]), before)
+        return self.encode(omega, np.array([end - first]))[0], float(residuals[0])
+
+    def plan(self, option: FloatArray, before: FloatArray | None = None) -> FloatArray:
+        """All actions of an option, normalised.
+
+        :param option: shape ``[action_dim · n_weights + 1]``, entries in [−1, 1]
+        :param before: with a continuous join the action that is being sent when it begins, normalised, shape ``[action_dim]``
+        :return: shape ``[n_steps, action_dim]``
+        :raises ValueError: if ``before`` is missing with a continuous join, or given with a free one
+        """
+        if (before is not None) != self.joined:
+            raise ValueError(f"with join={self.join!r} a plan depends {'' if self.joined else 'not '}on the action before it")
         omega, n_steps = self.decode(option)
-        return self.trajectory.plan(omega, n_steps)
+        return self.trajectory.plan(omega, n_steps, before)
 
 
 class ActionBox:
@@ -160,6 +206,18 @@ class ActionBox:
     def scale(self, trajectory: FloatArray) -> FloatArray:
         """Normalised actions in the units of the box, in double precision: shape ``[n_steps, action_dim]``, as given."""
         return (trajectory + 1.0) * self._half_width + self._bottom
+
+    def normalise(self, actions: npt.ArrayLike) -> FloatArray:
+        """The inverse of :meth:`scale`, for actions ``[n_steps, *action_shape]``: shape ``[n_steps, action_dim]``.
+
+        :raises ValueError: if they have another shape
+        """
+        given = np.asarray(actions, dtype=np.float64)
+        if given.ndim == 0 or given.shape[1:] != self.low.shape:
+            raise ValueError(f"actions must have shape [n, *{self.low.shape}], not {given.shape}")
+        # Where both bounds are the same, there is nothing to say, which is 0.
+        width = np.where(self._half_width > 0, self._half_width, 1.0)
+        return (given.reshape(len(given), -1) - self._bottom - self._half_width) / width
 
     def cast(self, actions: FloatArray) -> npt.NDArray[Any]:
         """Actions in the units of the box, in its shape and precision: ``[n_steps, *action_shape]``."""

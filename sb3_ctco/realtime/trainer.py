@@ -31,6 +31,7 @@ from stable_baselines3.common.vec_env import VecEnv, VecEnvWrapper
 from stable_baselines3.common.vec_env.base_vec_env import VecEnvObs, VecEnvStepReturn
 
 from sb3_ctco.common.option_algorithm import OptionOffPolicyAlgorithm
+from sb3_ctco.options import ValueInterrupt
 from sb3_ctco.realtime.journal import JournalReader, JournalWriter, check_meaning, repair_journal, segments
 from sb3_ctco.realtime.learner import (
     LearnerError,
@@ -358,6 +359,11 @@ def _check_model_and_env(model: Any, env: Any) -> None:
 def _check_functions(safe_stop: Any, interrupt: Any) -> None:
     if not callable(safe_stop):
         raise TypeError(f"safe_stop must be a function of the bare environment, not {safe_stop!r}: it leaves the machine safe")
+    if isinstance(interrupt, ValueInterrupt):
+        raise TypeError(
+            f"interrupt must be a rule about observations, not {type(interrupt).__name__}: the acting process gets the "
+            "actor's weights, not the critics'"
+        )
     if not (interrupt is None or callable(interrupt)):
         raise TypeError(f"interrupt must be a function or None, not {interrupt!r}")
 

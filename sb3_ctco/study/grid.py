@@ -186,18 +186,21 @@ def _grid(preset: str, content: Any) -> list[Run]:
         )
         for seed in range(content["seeds"])
         for rate, name, settings in cells
-        for algorithm, setting, arguments in entries
+        for algorithm, setting, arguments, rates in entries
+        if rates is None or rate in rates
     ]
 
 
-def _entries(where: str, algorithms: Any) -> list[tuple[str, str, dict[str, Any]]]:
-    """Algorithms with their settings and arguments."""
+def _entries(where: str, algorithms: Any) -> list[tuple[str, str, dict[str, Any], list[int] | None]]:
+    """Algorithms with their settings and arguments, and the rates that they are run at, None for all."""
     if not (isinstance(algorithms, dict) and algorithms):
         raise ValueError(f"{where}: algorithms must be a mapping of names to setting and arguments, not {algorithms!r}")
     entries = []
     for name, entry in algorithms.items():
         of_entry = f"{where}, algorithm {name}"
-        _check_keys(of_entry, entry, ("setting", "arguments"), optional=("algorithm",))
+        _check_keys(of_entry, entry, ("setting", "arguments"), optional=("algorithm", "rates"))
+        if "rates" in entry:
+            _check_rates(of_entry, entry["rates"])
         algorithm, setting = entry.get("algorithm", name), str(entry["setting"])
         if algorithm not in list(ALGORITHMS):
             raise ValueError(
@@ -208,7 +211,7 @@ def _entries(where: str, algorithms: Any) -> list[tuple[str, str, dict[str, Any]
                 f"{of_entry}: setting becomes part of a folder's name, so it must be of letters, digits and _ . + -, not "
                 f"{entry['setting']!r}"
             )
-        entries.append((algorithm, setting, _checked_arguments(of_entry, entry["arguments"])))
+        entries.append((algorithm, setting, _checked_arguments(of_entry, entry["arguments"]), entry.get("rates")))
     names = [entry[:2] for entry in entries]
     if len(set(names)) < len(names):
         raise ValueError(f"{where}: two entries have the same algorithm and setting, in {names}")
