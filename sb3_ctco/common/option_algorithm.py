@@ -442,6 +442,22 @@ class OptionOffPolicyAlgorithm(OffPolicyAlgorithm):
             callbacks.append(OptionProgressBarCallback())
         return super()._init_callback(CallbackList(callbacks))
 
+    def learn(
+        self: SelfOptionOffPolicyAlgorithm,
+        total_timesteps: int,
+        callback: MaybeCallback = None,
+        log_interval: int = 4,
+        tb_log_name: str | None = None,
+        reset_num_timesteps: bool = True,
+        progress_bar: bool = False,
+    ) -> SelfOptionOffPolicyAlgorithm:
+        """Learn for ``total_timesteps`` primitive steps, up to the end of the option that reaches them.
+
+        Parameters are those of Stable-Baselines3's ``learn``; ``tb_log_name`` is the class's name by default.
+        """
+        name = type(self).__name__ if tb_log_name is None else tb_log_name
+        return super().learn(total_timesteps, callback, log_interval, name, reset_num_timesteps, progress_bar)
+
     def collect_rollouts(
         self,
         env: VecEnv,

@@ -3,13 +3,13 @@
 import contextlib
 import math
 from collections.abc import Callable, Iterator
-from typing import Any, ClassVar, Literal, TypeVar
+from typing import Any, ClassVar, Literal
 
 import torch as th
 from stable_baselines3.common.buffers import ReplayBuffer
 from stable_baselines3.common.noise import ActionNoise
 from stable_baselines3.common.policies import BasePolicy
-from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, PyTorchObs, ReplayBufferSamples, Schedule
+from stable_baselines3.common.type_aliases import GymEnv, PyTorchObs, ReplayBufferSamples, Schedule
 from stable_baselines3.common.utils import FloatSchedule, update_learning_rate
 from torch import nn
 
@@ -20,8 +20,6 @@ from sb3_ctco.ctco.canonical import CanonicalOptions
 from sb3_ctco.ctco.fast_update import FastUpdate
 from sb3_ctco.ctco.policies import CnnPolicy, CTCOPolicy, MlpPolicy, MultiInputPolicy, OptionActor, OptionCritic
 from sb3_ctco.options import DurationScale, Join, Trajectory, default_durations, discount_rate_from_gamma
-
-SelfCTCO = TypeVar("SelfCTCO", bound="CTCO")
 
 
 def _longest(d_max: float | None, gamma: float, gamma_dt: float) -> float:
@@ -417,28 +415,6 @@ class CTCO(SoftOptionActorCritic):
         shortfall = max(-1.0, 1.0 - self.target_decision_rate * time_played / decisions)
         self.log_high_freq_penalty.grad = th.tensor(-shortfall)
         self.high_freq_penalty_optimizer.step()
-
-    def learn(
-        self: SelfCTCO,
-        total_timesteps: int,
-        callback: MaybeCallback = None,
-        log_interval: int = 4,
-        tb_log_name: str = "CTCO",
-        reset_num_timesteps: bool = True,
-        progress_bar: bool = False,
-    ) -> SelfCTCO:
-        """Learn for ``total_timesteps`` primitive steps, up to the end of the option that reaches them.
-
-        Parameters are those of Stable-Baselines3's ``learn``.
-        """
-        return super().learn(
-            total_timesteps=total_timesteps,
-            callback=callback,
-            log_interval=log_interval,
-            tb_log_name=tb_log_name,
-            reset_num_timesteps=reset_num_timesteps,
-            progress_bar=progress_bar,
-        )
 
     def _excluded_save_params(self) -> list[str]:
         derived = [
