@@ -36,14 +36,18 @@ def shortest_steps(space: OptionSpace) -> int:
 def draw_stretches(rng: np.random.Generator, n: int, n_steps: int, shortest: int) -> list[tuple[int, int]]:
     """Random stretches of an option of ``n_steps``, of at least ``shortest`` steps, and not all of it.
 
-    :param n: how many to draw; those that are too short or all of it are left out
+    There are fewer of them than steps. Otherwise what is played when options are still long would fill most of a replay buffer
+    if options become as short as a step.
+
+    :param n: how many to draw; those that are too short, all of it or drawn before are left out
     :return: pairs of the first step, and the step after the last
     """
     if n == 0 or n_steps <= shortest:
         return []
-    pairs = rng.integers(0, n_steps + 1, size=(n, 2))
+    pairs = rng.integers(0, n_steps + 1, size=(min(n, n_steps - 1), 2))
     pairs.sort(axis=1)
-    return [(first, end) for first, end in pairs.tolist() if shortest <= end - first < n_steps]
+    drawn = dict.fromkeys(map(tuple, pairs.tolist()))
+    return [(first, end) for first, end in drawn if shortest <= end - first < n_steps]
 
 
 @dataclass(frozen=True, eq=False)

@@ -25,8 +25,10 @@ from stable_baselines3 import HerReplayBuffer
 from stable_baselines3.common.callbacks import BaseCallback, CallbackList, ConvertCallback
 from stable_baselines3.common.env_util import unwrap_wrapper
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
-from stable_baselines3.common.type_aliases import MaybeCallback
+from stable_baselines3.common.type_aliases import MaybeCallback, TrainFreq, TrainFrequencyUnit
 from stable_baselines3.common.utils import get_device
+from stable_baselines3.common.vec_env import VecEnv, VecEnvWrapper
+from stable_baselines3.common.vec_env.base_vec_env import VecEnvObs, VecEnvStepReturn
 
 from sb3_ctco.common.option_algorithm import OptionOffPolicyAlgorithm
 from sb3_ctco.options import ValueInterrupt
@@ -242,34 +244,19 @@ class AsynchronousTrainer(Generic[AlgorithmType]):
         process.start()
         learner_end.close()
         link = _Link(process, report, weights, model)
-        callbacks = CallbackList([_AsynchronousCallback(self, link), *_as_list(callback)])
-        replay_buffer = model.replay_buffer
+        in_between = _AsynchronousCallback(self, link)
+        callbacks = CallbackList([in_between, *_as_list(callback)])
         try:
             with _sigterm_as_exit():
                 link.wait_until_ready()
                 self._supervisor.check = link.check
-                model.replay_buffer = _JournalBuffer(journal, model)  # type: ignore[assignment]
-                overrides = {"train": _learned_elsewhere, "_sample_action": self._timed(model._sample_action, weights)}
-                excluded = [*model._excluded_save_params(), *overrides, "_excluded_save_params"]
-                # What is put on the instance hides the class's own methods; a CheckpointCallback must not save it.
-                model.__dict__.update(overrides, _excluded_save_params=lambda: excluded)
                 with _prompt_threads(), _scheduled(self.acting_priority):
-                    model.learn(
-                        remaining,
-                        callbacks,
-                        log_interval=log_interval,
-                        tb_log_name=tb_log_name,
-                        reset_num_timesteps=model.num_timesteps == 0,
-                        progress_bar=progress_bar,
-                    )
+                    self._act(in_between, journal, remaining, callbacks, log_interval, tb_log_name, progress_bar)
         finally:
             self._supervisor.check = None
             try:
                 self._make_safe()
             finally:
-                model.replay_buffer = replay_buffer
-                for name in ("train", "_sample_action", "_excluded_save_params"):
-                    model.__dict__.pop(name, None)
                 try:
                     journal.close()
                 finally:
@@ -278,6 +265,38 @@ class AsynchronousTrainer(Generic[AlgorithmType]):
         link.raise_if_failed()
         self._load_checkpoint()
         return model
+
+    def _act(
+        self,
+        in_between: "_AsynchronousCallback",
+        journal: JournalWriter,
+        total_timesteps: int,
+        callback: MaybeCallback,
+        log_interval: int,
+        tb_log_name: str,
+        progress_bar: bool,
+    ) -> None:
+        """``OffPolicyAlgorithm.learn`` of Stable-Baselines3 2.9.2 with a journal for replay buffer, and without ``train``."""
+        model = self.model
+        total_timesteps, callback = model._setup_learn(
+            total_timesteps, callback, model.num_timesteps == 0, tb_log_name, progress_bar
+        )
+        callback.on_training_start(locals(), globals())
+        assert model.env is not None
+        env = _DecidedEnv(model.env, in_between)
+        while model.num_timesteps < total_timesteps:
+            rollout = model.collect_rollouts(
+                env,
+                callback,
+                TrainFreq(1, TrainFrequencyUnit.STEP),  # nobody trains here
+                _JournalBuffer(journal, model),  # type: ignore[arg-type]
+                model.action_noise,
+                model.learning_starts,
+                log_interval,
+            )
+            if not rollout.continue_training:
+                break
+        callback.on_training_end()
 
     def restore_replay_buffer(self) -> None:
         """Fill the model's own replay buffer with everything that was collected, for instance to learn on in place."""
@@ -321,16 +340,6 @@ class AsynchronousTrainer(Generic[AlgorithmType]):
         while records := journal.read(1000):
             self.model.num_timesteps = Transition.from_arrays(records[-1]).num_timesteps
         journal.close()
-
-    def _timed(self, sample_action: Callable[..., Any], weights: SharedWeights) -> Callable[..., Any]:
-        def timed(*args: Any, **kwargs: Any) -> Any:
-            start = time.perf_counter()
-            result = sample_action(*args, **kwargs)
-            self.decision_seconds.append(time.perf_counter() - start)
-            self.weight_ages.append(weights.age)
-            return result
-
-        return timed
 
 
 def _check_model_and_env(model: Any, env: Any) -> None:
@@ -408,10 +417,6 @@ def _as_list(callback: MaybeCallback) -> list[BaseCallback]:
     if callback is None or isinstance(callback, list):
         return callback or []
     return [callback if isinstance(callback, BaseCallback) else ConvertCallback(callback)]
-
-
-def _learned_elsewhere(gradient_steps: int, batch_size: int = 64) -> None:
-    """In place of the model's ``train``."""
 
 
 class _Supervisor(gym.Wrapper):
@@ -530,8 +535,16 @@ class _AsynchronousCallback(BaseCallback):
         self.trainer = trainer
         self.link = link
 
+        self._decision_began = 0.0
+
     def _on_rollout_start(self) -> None:
         self.link.weights.fetch(acting_module(self.link.model))
+        self._decision_began = time.perf_counter()
+
+    def decided(self) -> None:
+        """The policy has decided."""
+        self.trainer.decision_seconds.append(time.perf_counter() - self._decision_began)
+        self.trainer.weight_ages.append(self.link.weights.age)
 
     def _on_step(self) -> bool:
         if self.link.log:
@@ -546,6 +559,24 @@ class _AsynchronousCallback(BaseCallback):
                 self.logger.record("real_time/late_ticks", statistics.late_ticks)
                 self.logger.record("real_time/worst_lateness", statistics.worst_lateness)
         return True
+
+
+class _DecidedEnv(VecEnvWrapper):
+    """Tells of each decision when it reaches the environment."""
+
+    def __init__(self, venv: VecEnv, in_between: _AsynchronousCallback):
+        super().__init__(venv)
+        self.in_between = in_between
+
+    def reset(self) -> VecEnvObs:
+        return self.venv.reset()
+
+    def step_async(self, actions: np.ndarray) -> None:
+        self.in_between.decided()
+        self.venv.step_async(actions)
+
+    def step_wait(self) -> VecEnvStepReturn:
+        return self.venv.step_wait()
 
 
 @contextmanager
