@@ -731,7 +731,7 @@ def test_bad_action_spaces(scripted_env):
         make(scripted_env(action_space=spaces.Box(-np.inf, np.inf, (1,))))
     with pytest.raises(ValueError, match="pass dt"):
         make(scripted_env(dt=None))
-    assert make(scripted_env(dt=None), dt=0.5).dt == 0.5
+    assert make(scripted_env(dt=None), dt=0.4).dt == 0.4
 
 
 @pytest.mark.parametrize("bad", ["nan reward", "inf reward", "nan observation", "error"])

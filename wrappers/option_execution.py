@@ -25,6 +25,7 @@ from sb3_ctco.options import (
     OptionSpace,
     RewardUnit,
     Trajectory,
+    default_durations,
     draw_stretches,
     integrated_reward,
     rows_of,
@@ -70,8 +71,10 @@ class OptionExecutionWrapper(gym.Wrapper, RecordConstructorArgs):
 
     :param env: the environment to wrap; its action space must be a ``Box`` with finite bounds, of any shape
     :param n_rbf: number of radial basis functions an action dimension; 1 repeats one action
-    :param d_max: longest duration, in s
-    :param d_min: shortest duration, in s; one step (``dt``) by default
+    :param d_max: longest duration, in s; by default a fifth of the horizon 1/τ, 0.5 s at most, see
+        :func:`~sb3_ctco.options.default_durations`
+    :param d_min: shortest duration, in s, and never less than one step (``dt``), which 0 stands for; by default a hundredth of
+        the horizon
     :param dt: the interaction period, in s; by default what :func:`find_dt` finds
     :param discount_rate: τ, in 1/s; by default the paper's 0.404 (a factor of 0.98 over 0.05 s)
     :param reward: what ``step`` returns as reward: ``"sum"`` of the primitive rewards, which makes returns comparable
@@ -96,7 +99,7 @@ class OptionExecutionWrapper(gym.Wrapper, RecordConstructorArgs):
         self,
         env: gym.Env,
         n_rbf: int = 3,
-        d_max: float = 0.5,
+        d_max: float | None = None,
         d_min: float | None = None,
         dt: float | None = None,
         discount_rate: float = DEFAULT_DISCOUNT_RATE,
@@ -143,9 +146,9 @@ class OptionExecutionWrapper(gym.Wrapper, RecordConstructorArgs):
             raise ValueError(f"sub_option_tolerance must be at least 0, not {sub_option_tolerance}")
         dt = find_dt(env, required_by="OptionExecutionWrapper") if dt is None else dt
         #: The settings that a policy for this environment must share.
-        self.option_space = OptionSpace.make(
-            n_rbf, d_max, dt if d_min is None else d_min, dt, discount_rate, trajectory, duration_scale, join
-        )
+        shortest, longest = default_durations(discount_rate)
+        d_min, d_max = shortest if d_min is None else d_min, longest if d_max is None else d_max
+        self.option_space = OptionSpace.make(n_rbf, d_max, max(d_min, dt), dt, discount_rate, trajectory, duration_scale, join)
         self.reward: Literal["sum", "integral"] = reward
         self.reward_unit: RewardUnit = reward_unit
 

@@ -19,14 +19,14 @@ from sb3_ctco.common.soft_actor_critic import SoftOptionActorCritic
 from sb3_ctco.ctco.canonical import CanonicalOptions
 from sb3_ctco.ctco.fast_update import FastUpdate
 from sb3_ctco.ctco.policies import CnnPolicy, CTCOPolicy, MlpPolicy, MultiInputPolicy, OptionActor, OptionCritic
-from sb3_ctco.options import DurationScale, Join, Trajectory
+from sb3_ctco.options import DurationScale, Join, Trajectory, default_durations, discount_rate_from_gamma
 
 SelfCTCO = TypeVar("SelfCTCO", bound="CTCO")
 
 
-def _longest(d_max: float | None, gamma_dt: float) -> float:
-    """The longest duration, in s: by default what follows from the horizon as the user states it."""
-    return 10.0 * gamma_dt if d_max is None else d_max
+def _longest(d_max: float | None, gamma: float, gamma_dt: float) -> float:
+    """The longest duration, in s: by default what follows from the discount."""
+    return default_durations(discount_rate_from_gamma(gamma, gamma_dt))[1] if d_max is None else d_max
 
 
 class CTCO(SoftOptionActorCritic):
@@ -64,8 +64,9 @@ class CTCO(SoftOptionActorCritic):
     :param n_sub_options: how many random stretches of each option that was played go into the replay buffer beside it,
         as options of their own, which counts in ``buffer_size``; 0 is the paper's way
     :param n_rbf: number of radial basis functions an action dimension
-    :param d_max: longest duration of an option, in s; ten ``gamma_dt`` by default
-    :param d_min: shortest duration, in s; by default one step of the environment
+    :param d_max: longest duration of an option, in s; by default a fifth of the horizon 1/τ, and 0.5 s at most
+    :param d_min: shortest duration, in s, and never less than one step of the environment, which 0 stands for; by default a
+        hundredth of the horizon, and 0.025 s at most, see :func:`~sb3_ctco.options.default_durations`
     :param dt: interaction period of the environment, in s; by default found in the environment
     :param trajectory: how ω becomes actions: ``"rbf"``, the paper's radial basis functions, ``"bezier"``, or a subclass of
         :class:`~sb3_ctco.options.Trajectory`
@@ -185,7 +186,7 @@ class CTCO(SoftOptionActorCritic):
             env,
             learning_rate,
             n_rbf=n_rbf,
-            d_max=_longest(d_max, gamma_dt),
+            d_max=_longest(d_max, gamma, gamma_dt),
             d_min=d_min,
             dt=dt,
             trajectory=trajectory,
@@ -233,7 +234,8 @@ class CTCO(SoftOptionActorCritic):
 
         :param arguments: the algorithm's arguments, defaults included
         """
-        return super().wrapper_kwargs({**arguments, "d_max": _longest(arguments["d_max"], arguments["gamma_dt"])})
+        longest = _longest(arguments["d_max"], arguments["gamma"], arguments["gamma_dt"])
+        return super().wrapper_kwargs({**arguments, "d_max": longest})
 
     @staticmethod
     def paper_defaults() -> dict[str, Any]:
@@ -252,6 +254,7 @@ class CTCO(SoftOptionActorCritic):
             "batch_size": 100,
             "n_sub_options": 0,
             "n_rbf": 3,
+            "d_min": 0.0,
             "high_freq_penalty": 0.05,
             "reward_scale": 1.0,
             "trajectory": "rbf",

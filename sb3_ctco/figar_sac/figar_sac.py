@@ -144,7 +144,7 @@ class FiGARSAC(SoftOptionActorCritic):
             learning_rate,
             n_rbf=1,
             d_max=d_max,
-            d_min=None,
+            d_min=0.0,
             dt=dt,
             gamma=gamma,
             gamma_dt=gamma_dt,
@@ -187,7 +187,7 @@ class FiGARSAC(SoftOptionActorCritic):
             )
         if d_max is None:
             d_max = (20 if n_repetitions is None else n_repetitions) * dt
-        fixed = {"n_rbf": 1, "d_min": None, "duration_scale": "linear", "join": "free"}
+        fixed = {"n_rbf": 1, "d_min": 0.0, "duration_scale": "linear", "join": "free"}
         return super().wrapper_kwargs({**arguments, **fixed, "d_max": d_max})
 
     def _resolve_repetitions(self, dt: float) -> None:

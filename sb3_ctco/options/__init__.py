@@ -32,7 +32,7 @@ from sb3_ctco.options.semi_mdp import (
     step_weight,
     steps_in,
 )
-from sb3_ctco.options.space import DURATION_SCALES, JOINS, ActionBox, DurationScale, Join, OptionSpace
+from sb3_ctco.options.space import DURATION_SCALES, JOINS, ActionBox, DurationScale, Join, OptionSpace, default_durations
 from sb3_ctco.options.sub_options import Stacked, SubOptions, draw_stretches, rows_of, shortest_steps, stack, sub_options
 from sb3_ctco.options.trajectory import TRAJECTORIES, BezierCurve, RadialBasis, Trajectory, basis_of_steps
 
@@ -59,6 +59,7 @@ __all__ = [
     "Trajectory",
     "ValueInterrupt",
     "basis_of_steps",
+    "default_durations",
     "discount",
     "discount_rate_from_gamma",
     "discounts_of_steps",

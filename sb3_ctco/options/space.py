@@ -7,13 +7,26 @@ from typing import Any, Literal
 import numpy as np
 import numpy.typing as npt
 
-from sb3_ctco.options.semi_mdp import FloatArray, steps_in
+from sb3_ctco.options.semi_mdp import DEFAULT_DISCOUNT_RATE, FloatArray, steps_in
 from sb3_ctco.options.trajectory import TRAJECTORIES, Trajectory
 
 DurationScale = Literal["log", "linear"]
 DURATION_SCALES: tuple[DurationScale, ...] = ("log", "linear")
 Join = Literal["free", "continuous"]
 JOINS: tuple[Join, ...] = ("free", "continuous")
+
+
+def default_durations(discount_rate: float) -> tuple[float, float]:
+    """The shortest and the longest duration where none is given, in s: a hundredth and a fifth of the horizon 1/τ.
+
+    An agent that decides much more often than that drowns its own exploration, and one of a fixed rate with the usual discount
+    of 0.99 a step decides just that often. The horizon counts as 2.475 s at most, that of the paper's discount of 0.98 over
+    0.05 s: 0.025 and 0.495 s.
+
+    :param discount_rate: τ, in 1/s
+    """
+    horizon = 1.0 / max(discount_rate, DEFAULT_DISCOUNT_RATE)
+    return 0.01 * horizon, 0.2 * horizon
 
 
 @dataclass(frozen=True)
@@ -50,7 +63,7 @@ class OptionSpace:
         if self.d_min > self.d_max:
             raise ValueError(
                 f"d_min={self.d_min} s is longer than d_max={self.d_max} s: "
-                "raise d_max, or pass a d_min (by default one step, dt) that is at most d_max"
+                f"raise d_max, or pass a smaller d_min (an option takes one step, dt={self.dt} s, or more)"
             )
         if not (self.discount_rate >= 0 and math.isfinite(self.discount_rate)):
             raise ValueError(f"discount_rate must be a finite number of 1/s that is at least 0, not {self.discount_rate}")
