@@ -338,12 +338,16 @@ class OptionOffPolicyAlgorithm(OffPolicyAlgorithm):
         if env is not None:
             kwargs["n_envs"] = env.num_envs if isinstance(env, VecEnv) else 1
         model = super().load(path, None, device, custom_objects, print_system_info, force_reset, **kwargs)
+        model._after_load()
         if env is not None:
             # Only now are the settings known that a bare environment is wrapped with.
             model.set_env(env, force_reset)
             if model.seed is not None:
                 model.env.seed(model.seed)  # type: ignore[union-attr]
         return model
+
+    def _after_load(self) -> None:
+        """What is left to do when a file has been read; nothing here."""
 
     @classmethod
     def _saved_attributes(cls, path: str | pathlib.Path | io.BufferedIOBase) -> dict[str, Any]:
