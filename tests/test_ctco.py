@@ -174,18 +174,20 @@ def test_paper_entropies_need_the_papers_durations():
 
 def test_the_critics_see_what_is_played(random_walk_env):
     """Of one step the first of two weights is all: options that differ in the other have one value, and no gradient by it."""
-    model = make(random_walk_env(), n_rbf=2, d_max=0.5, trajectory="bezier", canonical_weights=True).learn(40)
+    model = make(random_walk_env(), n_rbf=2, d_max=0.5, trajectory="bezier", canonical_options=True).learn(40)
     obs = th.zeros(2, 2)
-    options = th.tensor([[0.3, 0.9, -1.0], [0.3, -0.4, -1.0]], requires_grad=True)  # of one step
+    # Of one step: up to 0.15 s, which is −0.75 on the way from 0.1 to 0.5 s
+    options = th.tensor([[0.3, 0.9, -1.0], [0.3, -0.4, -0.8]], requires_grad=True)
     values = model.critic(obs, model._as_critics_see(options))
     th.testing.assert_close(values[:, 0], values[:, 1])
     (gradient,) = th.autograd.grad(values.sum(), options)
-    assert (gradient[:, 1] == 0).all() and (gradient[:, 0] != 0).all()
-    longer = th.tensor([[0.3, 0.9, 1.0]])
-    th.testing.assert_close(model._as_critics_see(longer), longer)
-    # Where the shortest option has two steps, there is nothing to do.
-    assert make(random_walk_env(), n_rbf=2, d_min=0.2, canonical_weights=True).canonical_options is None
-    assert make(random_walk_env(), n_rbf=2).canonical_options is None
+    assert (gradient[:, 1] == 0).all() and (gradient[:, [0, 2]] != 0).all()
+    # Three steps are −1 + 2·0.2/0.4.
+    longer = th.tensor([[0.3, 0.9, 0.1]])
+    th.testing.assert_close(model._as_critics_see(longer), th.tensor([[0.3, 0.9, 0.0]]))
+    # Where the shortest option has two steps, weights stay as they are, and so does all.
+    for kwargs in ({"d_min": 0.2, "canonical_options": True}, {"canonical_options": False}):
+        assert make(random_walk_env(), n_rbf=2, d_max=0.5, **kwargs)._as_critics_see(longer) is longer
 
 
 def test_what_was_counted_goes_on_after_loading(tmp_path, random_walk_env):

@@ -91,7 +91,7 @@ class OptionOffPolicyAlgorithm(OffPolicyAlgorithm):
         "duration_scale",
         "join",
         "reward_scale",
-        "canonical_weights",
+        "canonical_options",
         "n_repetitions",
         "ent_coef",
         "duration_ent_coef",
@@ -101,7 +101,12 @@ class OptionOffPolicyAlgorithm(OffPolicyAlgorithm):
     _own_setting: ClassVar[str] = "discount_rate"
 
     #: Of arguments that older files do not have: what their networks were trained with
-    _before_it_was_saved: ClassVar[dict[str, Any]] = {"duration_scale": "linear", "join": "free", "reward_scale": 1.0}
+    _before_it_was_saved: ClassVar[dict[str, Any]] = {
+        "trajectory": "rbf",
+        "duration_scale": "linear",
+        "join": "free",
+        "reward_scale": 1.0,
+    }
 
     def __init__(
         self,

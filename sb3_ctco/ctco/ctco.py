@@ -88,9 +88,8 @@ class CTCO(SoftOptionActorCritic):
         one nat a dimension in all: explore first, then get precise; 0 keeps them
     :param duration_learning_rate: step size of d's head; ``learning_rate`` by default
     :param entropy_reference: ``"uniform"``, ``"average"`` or ``"paper"``, see :func:`log_reference_density`
-    :param canonical_weights: whether critics see, in the place of ω, weights that are the same for all options that play the
-        same actions, which makes a difference to options of fewer steps than ``n_rbf``, see
-        :class:`~sb3_ctco.ctco.canonical.CanonicalOptions`
+    :param canonical_options: whether critics see the same vector for all options that play the same actions, see
+        :class:`~sb3_ctco.ctco.canonical.CanonicalOptions`; without it they see ω and d as they are, the paper's way
     :param fast_updates: whether to compute gradients without autograd where that is known to give the same, see
         :mod:`sb3_ctco.ctco.fast_update`; ``fast_updates_refusal`` says why not where it is not
     :param action_noise: noise added to normalised options while exploring
@@ -107,6 +106,10 @@ class CTCO(SoftOptionActorCritic):
     """
 
     _own_setting: ClassVar[str] = "high_freq_penalty"
+    _before_it_was_saved: ClassVar[dict[str, Any]] = {
+        **SoftOptionActorCritic._before_it_was_saved,
+        "canonical_options": False,
+    }
 
     policy_aliases: ClassVar[dict[str, type[BasePolicy]]] = {
         "MlpPolicy": MlpPolicy,
@@ -151,7 +154,7 @@ class CTCO(SoftOptionActorCritic):
         target_entropy_anneal: float = 0.0,
         duration_learning_rate: float | Schedule | None = None,
         entropy_reference: EntropyReference = "uniform",
-        canonical_weights: bool = False,
+        canonical_options: bool = False,
         fast_updates: bool = True,
         action_noise: ActionNoise | None = None,
         replay_buffer_class: type[ReplayBuffer] | None = None,
@@ -219,7 +222,7 @@ class CTCO(SoftOptionActorCritic):
         self.high_freq_penalty = high_freq_penalty
         self.target_decision_rate = target_decision_rate
         self.target_entropy_anneal = target_entropy_anneal
-        self.canonical_weights = canonical_weights
+        self.canonical_options = canonical_options
         self.fast_updates = fast_updates
         self.duration_learning_rate = duration_learning_rate
         self.entropy_reference: EntropyReference = entropy_reference
@@ -270,10 +273,10 @@ class CTCO(SoftOptionActorCritic):
         self._parts = th.zeros(self.actor.omega_dim + 1, n + 1, device=self.device)
         self._parts[:-1, :n] = th.eye(n, device=self.device).repeat(self.actor.omega_dim // n, 1)
         self._parts[-1, -1] = 1.0
-        #: What makes options canonical for the critics; None where it makes no difference or is not wanted
-        self.canonical_options: CanonicalOptions | None = None
-        if self.canonical_weights and not CanonicalOptions.makes_no_difference(space):
-            self.canonical_options = CanonicalOptions(space, self.device)
+        # None where it makes no difference or is not wanted
+        self._canonical: CanonicalOptions | None = None
+        if self.canonical_options and not CanonicalOptions.makes_no_difference(space):
+            self._canonical = CanonicalOptions(space, self.device)
         self._fast_update: FastUpdate | None = None
         #: Why updates were made with autograd in the last training; None if they were not
         self.fast_updates_refusal: str | None = None
@@ -356,7 +359,7 @@ class CTCO(SoftOptionActorCritic):
         return self.critic(data.observations, self._as_critics_see(data.actions))
 
     def _as_critics_see(self, options: th.Tensor) -> th.Tensor:
-        return options if self.canonical_options is None else self.canonical_options(options)
+        return options if self._canonical is None else self._canonical(options)
 
     def train(self, gradient_steps: int, batch_size: int = 64) -> None:
         """Sample the replay buffer and update temperatures, critics, actor and targets.
@@ -423,7 +426,7 @@ class CTCO(SoftOptionActorCritic):
     def _excluded_save_params(self) -> list[str]:
         derived = [
             "actor_target",
-            "canonical_options",
+            "_canonical",
             "_log_reference",
             "_parts",
             "_last_next_values",

@@ -130,8 +130,8 @@ class FastUpdate:
         q_min = q_values.amin(dim=0)
         pi_loss = (model.entropy_costs(log_prob[0]) - q_min).mean()
         option_gradient = self._critics.input_gradient((q_values == q_min) / -batch_size, first=features.shape[2])
-        if model.canonical_options is not None:
-            option_gradient = model.canonical_options.gradient(option_gradient, options[0])
+        if model._canonical is not None:
+            option_gradient = model._canonical.gradient(option_gradient, options[0])
         self._actors.backward(option_gradient, model.ent_coefs / batch_size)
         self._actor_adam.step()
 
