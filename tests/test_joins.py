@@ -391,7 +391,7 @@ def test_pendulum_is_learned():
         "Pendulum-v1",
         join="continuous",
         learning_rate=1e-3,
-        learning_starts=1000,
+        learning_starts=500,
         batch_size=128,
         updates_per_second=20,
         n_rbf=2,
@@ -402,7 +402,7 @@ def test_pendulum_is_learned():
         policy_kwargs={"net_arch": [64, 64]},
         seed=0,
         device="cpu",
-    ).learn(10_000)
+    ).learn(6_000)
     env = model.wrap_env(gym.make("Pendulum-v1"))
     env.reset(seed=100)
     episodes = evaluate_discounted_return(model, env, 10)
