@@ -217,7 +217,7 @@ class ActionBox:
             raise ValueError(f"actions must have shape [n, *{self.low.shape}], not {given.shape}")
         # Where both bounds are the same, there is nothing to say, which is 0.
         width = np.where(self._half_width > 0, self._half_width, 1.0)
-        return (given.reshape(len(given), self.low.size) - self._bottom - self._half_width) / width
+        return (given.reshape(len(given), self._bottom.size) - self._bottom - self._half_width) / width
 
     def cast(self, actions: FloatArray) -> npt.NDArray[Any]:
         """Actions in the units of the box, in its shape and precision: ``[n_steps, *action_shape]``."""
