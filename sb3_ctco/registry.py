@@ -195,7 +195,7 @@ _SAC: dict[str, Any] = {
 def _make_dac_ppo(make_env: Callable[[], gym.Env], dt: float, arguments: dict[str, Any]) -> DACPPO:
     discount_rate = discount_rate_from_gamma(arguments["gamma"], arguments["gamma_dt"])
     env = _with_reward_rate(make_env, dt, discount_rate, arguments.pop("n_envs", 1))
-    return DACPPO("MlpPolicy", VecNormalize(env, norm_reward=False), **arguments)
+    return DACPPO(env=VecNormalize(env, norm_reward=False), **{"policy": "MlpPolicy", **arguments})
 
 
 def _make_dac_ppo_eval_env(model: DACPPO, make_env: Callable[[], gym.Env], dt: float, discount_rate: float) -> VecEnv:

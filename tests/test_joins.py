@@ -224,6 +224,22 @@ def test_an_environment_may_say_what_is_being_sent(scripted_env):
     np.testing.assert_allclose(np.ravel(env.unwrapped.actions), [0.75, 1.0])
 
 
+@pytest.mark.parametrize("n_sub_options", [0, 4])
+def test_an_environment_may_send_something_else(scripted_env, n_sub_options):
+    class Limited(scripted_env):
+        def step(self, action):
+            *result, info = super().step(np.minimum(action, 0.5))
+            return *result, {**info, LAST_ACTION: self.actions[-1]}
+
+    env = joined(Limited(), n_rbf=1, d_max=0.4, n_sub_options=n_sub_options)
+    env.reset(seed=0)
+    obs, *_, info = env.step([1.0, 1.0])
+    assert obs[-1] == 0.5
+    if n_sub_options:
+        assert (info["sub_options"].seen[-1] == obs).all()
+    np.testing.assert_allclose(env.plan([1.0, 1.0])[:, 0], [0.625, 0.75, 0.875, 1.0])
+
+
 @pytest.mark.parametrize("kind", ["vector", "image", "dict"])
 def test_where_observations_hold_it(random_walk_env, kind):
     env = joined(random_walk_env(kind))

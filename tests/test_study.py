@@ -173,7 +173,7 @@ def of_ctco(**changes):
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
-        ({"tasks": ["walker"]}, r"no task 'walker': name one of .*'ball_in_cup'\], or an id of Gymnasium's registry"),
+        ({"tasks": ["walker"]}, r"no task 'walker': name one of .*'visual_reacher_hard'\], or an id of Gymnasium's registry"),
         ({"tasks": ["cheetah", "cheetah"]}, "tasks must be a list of tasks, each once, or a mapping"),
         ({"tasks": {"cheetah": {"rate": 50}}}, r"task cheetah: \[\] missing, \['rate'\] unknown"),
         ({"tasks": {"cheetah": {"evaluations": 0}}}, "task cheetah: evaluations must be a whole number from 1, not 0"),

@@ -88,7 +88,8 @@ class OptionExecutionWrapper(gym.Wrapper, RecordConstructorArgs):
     :param duration_scale: ``"log"`` or ``"linear"``, see :class:`~sb3_ctco.options.OptionSpace`
     :param join: ``"free"``, or ``"continuous"``: an option leaves from the action that is being sent when it begins. That
         action, normalised, is then part of the observation (:mod:`sb3_ctco.options.joins`); an episode begins with the middle
-        of the box, or with ``info["last_action"]`` of the environment's ``reset``, in its own units
+        of the box. Where the environment's info has a ``"last_action"``, after ``reset`` or after a step in which something
+        else was sent than it was given, that is taken, in the environment's units
     :raises TypeError: if the action space is not a ``Box``
     :raises ValueError: if its bounds are not finite, a setting is out of range, or dt is not given and not found
     """
@@ -241,9 +242,9 @@ class OptionExecutionWrapper(gym.Wrapper, RecordConstructorArgs):
             self._play = play
 
         n_ran = len(rewards)
-        last_action = self._keep_played(actions[:n_ran])
+        last_action = self._keep_played(actions[:n_ran], info)
         if before is not None:
-            self._last_action = self._box.normalise([last_action])[0]
+            self._last_action = self._box.normalise([last_action])[0].clip(-1.0, 1.0)
             obs = with_last_action(self.observation_space, obs, self._last_action)
         integral = integrated_reward(rewards, space.dt, space.discount_rate, self.reward_unit)
         info["option"] = OptionInfo(
@@ -256,7 +257,8 @@ class OptionExecutionWrapper(gym.Wrapper, RecordConstructorArgs):
             steps = [0, *observe[: len(observations)], n_ran]
             self._last_obs = rows_of(seen, -1)
             if before is not None:
-                last_actions = np.vstack([before, self._box.normalise(actions[np.array(steps[1:]) - 1])])
+                on_the_way = self._box.normalise(actions[np.array(steps[1:-1], dtype=np.int64) - 1])
+                last_actions = np.vstack([before, on_the_way, self._last_action])
                 seen = with_last_action(self.observation_space, seen, last_actions)
             played, ended = (trajectory, rewards, stretches, steps, seen), (terminated, truncated)
             info["sub_options"] = sub_options(space, *played, *ended, self.reward_unit, self.sub_option_tolerance, before)
@@ -273,10 +275,10 @@ class OptionExecutionWrapper(gym.Wrapper, RecordConstructorArgs):
             self.n_sub_options = n_sub_options
             self._play = None
 
-    def _keep_played(self, actions: np.ndarray) -> np.ndarray:
+    def _keep_played(self, actions: np.ndarray, info: dict[str, Any]) -> np.ndarray:
         """Keep the actions that were played, and tell the one that the next option leaves from."""
         self.played = actions
-        return actions[-1]
+        return np.asarray(info.get(LAST_ACTION, actions[-1]))
 
     def plan(self, option: npt.ArrayLike) -> np.ndarray:
         """All primitive actions of an option that begins now, in the inner environment's units.

@@ -161,8 +161,8 @@ class RealTimeOptionWrapper(OptionExecutionWrapper):
             self._executor.shutdown()
         super().close()
 
-    def _keep_played(self, actions: np.ndarray) -> np.ndarray:
-        last = super()._keep_played(self._played)
+    def _keep_played(self, actions: np.ndarray, info: dict[str, Any]) -> np.ndarray:
+        last = super()._keep_played(self._played, info)
         return last if self._rest is None else self._rest[-1]
 
     def _play_around_decisions(self, plan: np.ndarray) -> SequenceResult:

@@ -23,6 +23,7 @@ from sb3_ctco.options import (
     rows_of,
     shortest_steps,
     sub_options,
+    with_last_action,
 )
 from sb3_ctco.vec_env import PENDING
 
@@ -180,7 +181,9 @@ class _OptionStorage(ReplayBuffer):
         ``demonstration_fraction`` of each batch is drawn from them. Nothing is stored if anything is wrong.
 
         Options are in seconds, so the trajectory may have been recorded at another rate than the environment's. A stretch
-        is of whole recorded steps: where these are longer than d_min, no option is shorter than one of them.
+        is of whole recorded steps: where these are longer than d_min, no option is shorter than one of them. With a continuous
+        join a stretch leaves from the action before it, which is put into the observations here; the first leaves from the
+        middle of the box.
 
         :param observations: ``[n + 1, *observation_shape]``, in the end the one after the last action; or a dictionary of such
         :param actions: in the units of the environment, ``[n, *action_shape]``
@@ -216,6 +219,12 @@ class _OptionStorage(ReplayBuffer):
             )
         rewards = np.asarray(rewards, dtype=np.float64)
         plan = ActionBox(self.primitive_action_space.low, self.primitive_action_space.high).normalise(actions)
+        before: list[np.ndarray | None] = [None] * len(plan)
+        if space.joined:
+            # As an episode begins: with the middle of the box
+            sent = np.vstack([np.zeros((1, plan.shape[1])), plan])
+            before = list(sent)
+            observations = with_last_action(self.observation_space, observations, _as_many(sent, observations))
         seen = _recorded(observations, self.observation_space)
         _check_recorded(seen, plan, rewards)
 
@@ -232,7 +241,7 @@ class _OptionStorage(ReplayBuffer):
             window, rows = slice(first, end), slice(first, end + 1)
             played = (plan[window], rewards[window], stretches, list(range(end - first + 1)), rows_of(seen, rows))
             ended = (terminated and end == n_steps, truncated and end == n_steps)
-            parts.append(sub_options(space, *played, *ended, reward_unit, tolerance))
+            parts.append(sub_options(space, *played, *ended, reward_unit, tolerance, before[first]))
         added = sum(map(len, parts))
         if self.n_demonstrations + added >= self.buffer_size:
             raise ValueError(
@@ -389,6 +398,12 @@ def _recorded(observations: Any, space: spaces.Space) -> Stacked:
     if not np.isfinite(stacked).all():
         raise ValueError("observations must be finite, and these are not: leave out the steps where a sensor failed")
     return stacked
+
+
+def _as_many(rows: np.ndarray, observations: Any) -> np.ndarray:
+    """As many rows as there are observations, which are checked later."""
+    count = len(next(iter(observations.values())) if isinstance(observations, dict) else observations)
+    return np.resize(rows, (count, rows.shape[1]))
 
 
 def _check_recorded(seen: Stacked, plan: np.ndarray, rewards: np.ndarray) -> None:
