@@ -55,6 +55,7 @@ def test_deviations_are_those_of_the_code():
         "reward_scale",
         "trajectory",
         "duration_scale",
+        "join",
         "canonical_options",
         "d_min",
     }

@@ -262,6 +262,7 @@ class CTCO(SoftOptionActorCritic):
             "trajectory": "rbf",
             "duration_scale": "linear",
             "join": "free",
+            "canonical_options": False,
             "entropy_reference": "paper",
             "policy_kwargs": {"n_critics": 1, "net_arch": {"pi": [10, 10], "qf": [64, 64]}},
         }
