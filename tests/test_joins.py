@@ -329,7 +329,7 @@ def test_learns_from_each_kind_of_observation(random_walk_env, tmp_path, kind):
 
 def test_settings_of_model_and_environment_agree(random_walk_env):
     with pytest.raises(ValueError, match="the environment's options have join=continuous, CTCO has join=free"):
-        CTCO("MlpPolicy", joined(random_walk_env(), n_rbf=3, d_max=0.5), **SMALL)
+        CTCO("MlpPolicy", joined(random_walk_env(), n_rbf=3, d_max=0.5), d_max=0.5, **SMALL)
     arguments = {"join": "continuous", "gamma": 0.98, "gamma_dt": 0.05, "d_max": 0.4}
     assert CTCO.wrapper_kwargs(arguments)["join"] == "continuous"
     figar = {"gamma": 0.98, "gamma_dt": 0.05, "d_max": 0.4, "n_repetitions": None, "dt": None}
@@ -342,7 +342,7 @@ def test_several_environments(random_walk_env, vec_env_cls):
     env = make_vec_env(
         random_walk_env, 2, wrapper_class=OptionExecutionWrapper, wrapper_kwargs=kwargs, vec_env_cls=vec_env_cls, seed=0
     )
-    model = CTCO("MlpPolicy", env, join="continuous", learning_starts=50, gradient_steps=1, **SMALL).learn(150)
+    model = CTCO("MlpPolicy", env, join="continuous", d_max=0.5, learning_starts=50, gradient_steps=1, **SMALL).learn(150)
     assert model._n_updates > 0
     # An episode begins with the middle of the box.
     steps = model.replay_buffer.observations[: model.replay_buffer.pos, 0, 1]
@@ -391,7 +391,7 @@ def test_pendulum_is_learned():
         "Pendulum-v1",
         join="continuous",
         learning_rate=1e-3,
-        learning_starts=1000,
+        learning_starts=500,
         batch_size=128,
         updates_per_second=20,
         n_rbf=2,
@@ -402,7 +402,7 @@ def test_pendulum_is_learned():
         policy_kwargs={"net_arch": [64, 64]},
         seed=0,
         device="cpu",
-    ).learn(10_000)
+    ).learn(6_000)
     env = model.wrap_env(gym.make("Pendulum-v1"))
     env.reset(seed=100)
     episodes = evaluate_discounted_return(model, env, 10)

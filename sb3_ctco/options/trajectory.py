@@ -87,7 +87,7 @@ class Trajectory(ABC):
         if not len(firsts):
             return np.empty((0, plan.shape[1], self.n_weights)), np.empty(0)
         joined = start is not None
-        if joined:
+        if start is not None:
             # The action before a stretch is a row of it, and a weight that is known.
             plan, ends = np.vstack([start, plan]), ends + 1
         lengths = ends - firsts
