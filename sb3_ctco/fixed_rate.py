@@ -78,7 +78,8 @@ class QuickSACPolicy(SACPolicy):
         """Stable-Baselines3's ``predict``."""
         assert isinstance(observation, np.ndarray)
         x = observation.reshape(-1, self.actor.features_dim).astype(np.float32)
-        for layer in self.actor.latent_pi[0::2]:
+        layers: Any = self.actor.latent_pi
+        for layer in layers[0::2]:
             x = np.maximum(_affine(layer, x), 0.0)
         gaussian = _affine(self.actor.mu, x)
         if not deterministic:

@@ -256,7 +256,7 @@ class OptionExecutionWrapper(gym.Wrapper, RecordConstructorArgs):
         if seen is not None:
             steps = [0, *observe[: len(observations)], n_ran]
             self._last_obs = rows_of(seen, -1)
-            if before is not None:
+            if before is not None and self._last_action is not None:
                 on_the_way = self._box.normalise(actions[np.array(steps[1:-1], dtype=np.int64) - 1])
                 last_actions = np.vstack([before, on_the_way, self._last_action])
                 seen = with_last_action(self.observation_space, seen, last_actions)
