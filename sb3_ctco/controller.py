@@ -1,9 +1,11 @@
 """Run a trained policy in a control loop: an observation in, an action of the bare environment or robot out."""
 
 import json
+import logging
 import math
 import pickle
 import zipfile
+from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -14,11 +16,14 @@ import numpy.typing as npt
 from gymnasium import spaces
 
 from sb3_ctco.options import ActionBox, OptionSpace
+from sb3_ctco.safety import Guard, Safety
 
 if TYPE_CHECKING:
     from stable_baselines3.common.vec_env import VecNormalize
 
     from sb3_ctco.common.option_algorithm import OptionOffPolicyAlgorithm
+
+logger = logging.getLogger(__name__)
 
 Observation = npt.NDArray[Any] | dict[str, npt.NDArray[Any]]
 
@@ -246,7 +251,9 @@ class OptionController:
     """A trained policy as a controller: called once a control tick, it returns the action to apply until the next.
 
     It holds the option that runs, ω and d, and asks the policy for the next one when that has run out. Between two
-    decisions a tick reads an action from memory; the observation is not looked at.
+    decisions a tick at a fixed rate reads an action from memory and allocates nothing; the observation is not looked at. Who
+    gets an action may keep it: it is written once, when its option is decided on. The worst tick is one that decides
+    (``benchmarks/controller.py`` measures both).
 
     Ticks come either at a fixed rate, ``controller(obs)`` every ``dt`` seconds, where ``dt`` may be another than in
     training; or whenever they come, ``controller(obs, now=t)`` with a clock of your own, in s. An option's duration is
@@ -255,6 +262,11 @@ class OptionController:
 
     Several robots are driven at once by observations with a leading axis: each has an option of its own, and the
     policy is asked about those whose option has run out.
+
+    Ticks by a clock are real time, and guarded (:class:`~sb3_ctco.safety.Safety`): changes of actions are limited, and the
+    safe action takes their place while there is no fresh observation, or when the policy fails, by an exception or by
+    numbers that are not finite. That is counted in ``replaced`` and logged, and no exception reaches the loop. Without a new
+    observation pass None. Ticks every ``dt`` are a simulation's, and are not guarded.
 
     Example:
         >>> import gymnasium as gym
@@ -273,6 +285,7 @@ class OptionController:
         own way
     :param vec_normalize: normalises observations as in training, or the path it was saved to; needed for a path to a
         ``.zip`` only, and only if training normalised observations
+    :param safety: how ticks by a clock are guarded; None for not at all
     :raises TypeError: if the model decides by no options
     :raises ValueError: if ``dt`` is not a positive number, the file is of another kind, or ``deterministic`` or
         ``vec_normalize`` is given beside a policy that does not take it
@@ -285,6 +298,7 @@ class OptionController:
         dt: float | None = None,
         deterministic: bool = True,
         vec_normalize: "VecNormalize | str | Path | None" = None,
+        safety: Safety | None = Safety(),  # noqa: B008 (frozen)
     ):
         self.policy = _as_policy(policy, deterministic, vec_normalize)
         trained = self.policy.option_space
@@ -294,6 +308,15 @@ class OptionController:
         self._executions: list[_Execution] = []
         self._several = False
         self._now: float | None = None
+        #: Actions of the ticks up to the next decision, and which of them is next
+        self._rows: list[np.ndarray] = []
+        self._next = 0
+        self.safety = safety
+        self._guard: Guard | None = None
+        self._observed_at = -math.inf
+        self._sent_at: float | None = None
+        #: How many ticks by a clock sent the safe action, by reason
+        self.replaced: Counter[str] = Counter()
 
     @property
     def dt(self) -> float:
@@ -305,20 +328,25 @@ class OptionController:
 
         :param which: with several observations, those to reset: their indices or a mask; all of them by default
         """
+        self._rows, self._next = [], 0
         if which is None:
             self._executions = []
-            self._now = None
+            self._now = self._sent_at = self._guard = None
+            self._observed_at = -math.inf
         if not self._executions:
             return
         indices = np.arange(len(self._executions))[np.asarray(which)]
         for i in np.atleast_1d(indices):
             self._executions[i].n_steps = 0
 
-    def __call__(self, observation: Observation, now: float | None = None) -> np.ndarray:
+    def __call__(
+        self, observation: Observation | None, now: float | None = None, observed_at: float | None = None
+    ) -> np.ndarray:
         """The action to apply from this tick to the next.
 
-        :param observation: one observation, or several with a leading axis
+        :param observation: one observation, or several with a leading axis; by a clock also None, if there is no new one
         :param now: the time of this tick by the caller's clock, in s; None if ticks come every ``dt``
+        :param observed_at: the time of the observation by that clock, in s; ``now`` by default
         :return: shape ``[*action_shape]``, or ``[n, *action_shape]`` for n observations
         :raises ValueError: if ``now`` is not finite, runs backwards, or is given at some ticks and not at others; or if
             the number of observations changes without a reset
@@ -327,39 +355,68 @@ class OptionController:
         if executions:
             if (now is None) != (self._now is None):
                 raise ValueError("give now at each tick or at none; to change, call reset() in between")
-            if self._several and len(_first_leaf(observation)) != len(executions):
+            if self._several and observation is not None and len(_first_leaf(observation)) != len(executions):
                 raise ValueError(
                     f"there are {len(_first_leaf(observation))} observations, and there were {len(executions)}: "
                     "call reset() before their number changes"
                 )
         if now is not None:
-            return self._at(observation, float(now))
+            now = float(now)
+            if not (math.isfinite(now) and (self._now is None or now >= self._now)):
+                raise ValueError(f"now must be finite and must not run backwards, and it is {now} s after {self._now} s")
+            return self._at(observation, now) if self.safety is None else self._guarded(observation, now, observed_at)
 
-        due = [i for i, e in enumerate(executions) if e.tick >= e.n_steps]
-        if due or not executions:
-            self._decide(observation, due, 0.0)
-            executions = self._executions
-        actions = []
-        for e in executions:
-            actions.append(e.plan[e.tick])
+        if self._next == len(self._rows):
+            due = [i for i, e in enumerate(executions) if e.tick >= e.n_steps]
+            if due or not executions:
+                self._decide(observation, due, 0.0)
+            n_ticks = min(e.n_steps - e.tick for e in self._executions)
+            plans = [e.plan[e.tick : e.tick + n_ticks] for e in self._executions]
+            self._rows, self._next = list(np.stack(plans, axis=1) if self._several else plans[0]), 0
+        for e in self._executions:
             e.tick += 1
-        return np.stack(actions) if self._several else actions[0]
+        self._next += 1
+        return self._rows[self._next - 1]
 
-    def _at(self, observation: Observation, now: float) -> np.ndarray:
-        if not (math.isfinite(now) and (self._now is None or now >= self._now)):
-            raise ValueError(f"now must be finite and must not run backwards, and it is {now} s after {self._now} s")
+    def _guarded(self, observation: Observation | None, now: float, observed_at: float | None) -> np.ndarray:
+        assert self.safety is not None
+        if observation is not None:
+            self._observed_at = now if observed_at is None else observed_at
+        age = now - self._observed_at
+        low, high = self._box.low, self._box.high
+        actions, reason = low, None if age <= self.safety.stale_after else "no fresh observation"
+        if reason is None:
+            try:
+                actions = self._at(observation, now)
+            except Exception as error:  # the policy's own, of any kind
+                reason = "the policy failed"
+                if not (self._guard is not None and self._guard.is_safe_action):
+                    logger.error("the policy failed: %s: %s", type(error).__name__, error)
+        if self._guard is None or (reason is None and self._guard.low.shape != actions.shape):
+            self._guard = Guard(self.safety, np.broadcast_to(low, actions.shape), np.broadcast_to(high, actions.shape))
+            self._guard.replaced = self.replaced
+        seconds = self.dt if self._sent_at is None else now - self._sent_at
+        self._now = self._sent_at = now
+        command = self._guard.command(actions, seconds, reason=reason)
+        if self._guard.is_safe_action:
+            self._executions = []  # Whatever comes next is decided anew.
+        return command
+
+    def _at(self, observation: Observation | None, now: float) -> np.ndarray:
         dt = self.settings.dt
         due = [i for i, e in enumerate(self._executions) if now - e.start >= (e.n_steps - 0.5) * dt]
-        if due or not self._executions:
+        # Without an observation an option holds its last action, as it does past its end at a late tick.
+        if (due and observation is not None) or not self._executions:
             self._decide(observation, due, now)
         self._now = now
-        # A late tick may find the phase past its end, where the option holds its last action.
         phases = np.array([min((now - e.start) / (e.n_steps * dt), 1.0) for e in self._executions])
         features = self.settings.trajectory.basis(phases)
         actions = self._box.cast(np.array([row.dot(e.weights) for row, e in zip(features, self._executions, strict=True)]))
         return actions if self._several else actions[0]
 
-    def _decide(self, observation: Observation, due: list[int], now: float) -> None:
+    def _decide(self, observation: Observation | None, due: list[int], now: float) -> None:
+        if observation is None:
+            raise ValueError("the first tick, and each one at a fixed rate, needs an observation")
         if not self._executions:
             options = np.asarray(self.policy(observation))
             self._several = options.ndim == 2
@@ -376,6 +433,8 @@ class OptionController:
     def _begin(self, option: np.ndarray, now: float) -> _Execution:
         # As OptionExecutionWrapper does, in the same precision.
         option = np.clip(option.astype(np.float64), -1.0, 1.0)
+        if not np.isfinite(option).all():
+            raise ValueError(f"the policy returned an option that is not finite: {option}")
         omega, n_steps = self.settings.decode(option)
         plan = self._box.actions(self.settings.trajectory.plan(omega, n_steps))
         # Features sum to one, so that actions are the same combination of weights in their own units.

@@ -35,7 +35,7 @@ from sb3_ctco.wrappers.step_sequence import SequenceResult, StepSequence, find_s
 from sb3_ctco.wrappers.timing import find_dt
 
 #: Where the loop over ``step`` leaves what it observed on the way, so that an environment's own infos stay
-_ON_THE_WAY = "_observations_on_the_way"
+ON_THE_WAY = "_observations_on_the_way"
 
 
 class OptionExecutionWrapper(gym.Wrapper, RecordConstructorArgs):
@@ -207,7 +207,7 @@ class OptionExecutionWrapper(gym.Wrapper, RecordConstructorArgs):
         observe = sorted({k for ends in stretches for k in ends} - {0, n_steps})
         actions = self._box.actions(trajectory)
         obs, rewards, terminated, truncated, info = self._checked(play, actions, observe)
-        observations = info.pop(_ON_THE_WAY if _ON_THE_WAY in info else "observations", []) if observe else []
+        observations = info.pop(ON_THE_WAY if ON_THE_WAY in info else "observations", []) if observe else []
         # Stacked, they are copies, too: the environment may overwrite its own.
         seen = stack([self._last_obs, *observations, obs]) if self.n_sub_options else None
         if len(observations) and not is_finite(seen):
@@ -292,5 +292,5 @@ class OptionExecutionWrapper(gym.Wrapper, RecordConstructorArgs):
             if last < len(actions):
                 observations.append(deepcopy(obs))
         if observe:
-            info[_ON_THE_WAY] = observations
+            info[ON_THE_WAY] = observations
         return obs, rewards, terminated, truncated, info

@@ -1,15 +1,20 @@
 """Options on a machine that does not wait: decided ahead of time, and interrupted when the world changes."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
-from typing import Any
+from copy import deepcopy
+from typing import Any, SupportsFloat
 
 import gymnasium as gym
 import numpy as np
+import numpy.typing as npt
 from gymnasium.error import ResetNeeded
 from gymnasium.utils import RecordConstructorArgs
+from stable_baselines3.common.env_util import unwrap_wrapper
 
-from sb3_ctco.wrappers.option_execution import OptionExecutionWrapper
+from sb3_ctco.option_array import plain
+from sb3_ctco.wrappers.option_execution import ON_THE_WAY, OptionExecutionWrapper
+from sb3_ctco.wrappers.real_time import RealTimeWrapper
 from sb3_ctco.wrappers.step_sequence import SequenceResult, StepSequence
 
 #: ``interrupt(observation of the last decision, observation, seconds since that one)``: whether to end the option
@@ -28,7 +33,10 @@ class RealTimeOptionWrapper(OptionExecutionWrapper):
     as far as that does not matter. The first option of an episode begins at once.
 
     With ``interrupt``, a function that is called after each primitive step, an option ends as soon as it says so; the
-    transition has the time that ran.
+    transition has the time that ran. ``info["interrupted"]`` of the environment inside ends it as well.
+
+    An option that is not finite, of a policy that has diverged, is no error where commands are guarded
+    (:class:`~sb3_ctco.wrappers.RealTimeWrapper`): the safe action is sent, and the next decision follows.
 
     :param env: the environment to wrap
     :param decide_ahead: in s; rounded to whole steps
@@ -36,7 +44,7 @@ class RealTimeOptionWrapper(OptionExecutionWrapper):
     :param background: whether the rest of an option plays in a thread of its own, which is for environments that the
         wall clock governs and that may be stepped from another thread (one that renders may not)
     :param kwargs: see :class:`OptionExecutionWrapper`
-    :raises ValueError: if ``decide_ahead`` is negative or not shorter than the longest option, or for sub-options
+    :raises ValueError: if ``decide_ahead`` is negative or not shorter than the longest option
     """
 
     def __init__(
@@ -63,24 +71,22 @@ class RealTimeOptionWrapper(OptionExecutionWrapper):
         self._abandoned = False
         self._decided_on: Any = None
         self._play: StepSequence | None = None
+        real_time = unwrap_wrapper(env, RealTimeWrapper)
+        self._is_guarded = isinstance(real_time, RealTimeWrapper) and real_time.guard is not None
+        self._is_lost = False
 
-    def set_n_sub_options(self, n_sub_options: int) -> None:
-        """Sub-options are not possible in real time.
-
-        :raises ValueError: if any are asked for
-        """
-        if n_sub_options:
-            raise ValueError(
-                f"n_sub_options={n_sub_options} is not possible in real time, where a transition may consist of parts of "
-                "two options: pass n_sub_options=0"
-            )
-        super().set_n_sub_options(n_sub_options)
+    def step(self, action: npt.ArrayLike) -> tuple[Any, SupportsFloat, bool, bool, dict[str, Any]]:
+        """Play one option; see :meth:`OptionExecutionWrapper.step`."""
+        option = np.asarray(plain(action), dtype=np.float64)
+        self._is_lost = self._is_guarded and not np.isfinite(option).all()
+        # In its place the shortest one, whose actions the guard replaces.
+        return super().step(np.full_like(option, -1.0) if self._is_lost else option)
 
     @classmethod
     def like(
         cls, wrapper: OptionExecutionWrapper, decide_ahead: float, interrupt: Interrupt | None, background: bool
     ) -> "RealTimeOptionWrapper":
-        """The same wrapper around the same environment, with what this class adds, and without sub-options."""
+        """The same wrapper around the same environment, with what this class adds."""
         return cls(
             wrapper.env,
             decide_ahead,
@@ -89,6 +95,8 @@ class RealTimeOptionWrapper(OptionExecutionWrapper):
             **wrapper.option_space.arguments,
             reward=wrapper.reward,
             reward_unit=wrapper.reward_unit,
+            n_sub_options=wrapper.n_sub_options,
+            sub_option_tolerance=wrapper.sub_option_tolerance,
         )
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
@@ -118,8 +126,10 @@ class RealTimeOptionWrapper(OptionExecutionWrapper):
             self._executor.shutdown()
         super().close()
 
-    def _play_around_decisions(self, plan: np.ndarray) -> SequenceResult:
+    def _play_around_decisions(self, plan: np.ndarray, observe: Sequence[int] = ()) -> SequenceResult:
         rest = self._finish_rest()
+        if self._is_lost:
+            plan = np.full_like(plan, np.nan)
         # Something must happen between two decisions.
         n_now = max(len(plan) - self._ahead_steps, 0 if rest is not None else 1)
         over = rest is not None and (rest[2] or rest[3] or rest[4].get("interrupted", False))
@@ -128,9 +138,14 @@ class RealTimeOptionWrapper(OptionExecutionWrapper):
         else:
             result = self._play_until_interrupted(plan[:n_now], 0 if rest is None else len(rest[1]))  # type: ignore[arg-type]
             if rest is not None:
+                result[4][ON_THE_WAY] = [*rest[4][ON_THE_WAY], *result[4][ON_THE_WAY]]
                 result = (result[0], [*rest[1], *result[1]], *result[2:])  # type: ignore[misc]
             over = result[2] or result[3] or result[4].get("interrupted", False)
         self._decided_on = result[0]
+        # A sub-option that was decided on after k steps of this time would play as this option does from its step k on.
+        on_the_way = result[4].pop(ON_THE_WAY)
+        if observe:
+            result[4][ON_THE_WAY] = [on_the_way[k - 1] for k in observe if k < len(result[1])]
         if not over and n_now < len(plan):
             self._rest = plan[n_now:]
             if self._executor is not None:
@@ -146,16 +161,20 @@ class RealTimeOptionWrapper(OptionExecutionWrapper):
 
     def _play_until_interrupted(self, actions: np.ndarray, steps_before: int = 0) -> SequenceResult:
         rewards: list[Any] = []
+        observations: list[Any] = []
         for action in actions:
             if self._abandoned:
                 raise ResetNeeded("playing was abandoned: call reset() first")
             obs, reward, terminated, truncated, info = self.env.step(action)
             rewards.append(reward)
-            if terminated or truncated:
+            if self.n_sub_options:
+                # All of them, because those of a rest are chosen after it.
+                observations.append(deepcopy(obs))
+            if terminated or truncated or info.get("interrupted"):
                 break
             if self.interrupt is not None and self.interrupt(
                 self._decided_on, obs, (steps_before + len(rewards)) * self.option_space.dt
             ):
                 info = {**info, "interrupted": True}
                 break
-        return obs, rewards, terminated, truncated, info
+        return obs, rewards, terminated, truncated, {**info, ON_THE_WAY: observations}
