@@ -131,7 +131,7 @@ def test_a_tick_longer_than_the_shortest_duration_still_runs_one_tick():
 
 def test_a_clock_at_the_fixed_rate_gives_the_same_actions(pendulum_model):
     dt = pendulum_model.dt
-    by_tick, by_clock = OptionController(pendulum_model), OptionController(pendulum_model)
+    by_tick, by_clock = OptionController(pendulum_model), OptionController(pendulum_model, safety=None)
     observations = np.random.default_rng(0).normal(size=(100, 3)).astype(np.float32)
     for i, obs in enumerate(observations):
         # The ends of options fall on the same ticks, although i·dt is rounded.

@@ -116,7 +116,7 @@ def test_the_shortest_option_bounds_how_fast_actions_change():
 def test_a_fit_over_the_whole_option_returns_its_weights(kind, omega, start, n_steps):
     trajectory, start = kind(omega.shape[1]), np.full(omega.shape[0], start)
     plan = trajectory.plan(omega, n_steps, start)
-    [fitted], [residual] = trajectory.fit(plan, np.array([0]), np.array([n_steps]), start)
+    [fitted], [residual] = trajectory.fit(plan, np.array([0]), np.array([n_steps]), start[None])
     if n_steps >= omega.shape[1]:
         assert residual < 1e-9
     if n_steps >= 2 * omega.shape[1]:
@@ -127,7 +127,7 @@ def test_a_stretch_leaves_from_the_action_before_its_first_step():
     # From 0 to 1 in ten steps of 0.1: the steps 3 to 6 go from 0.3 to 0.7, so one weight of 0.7 plays them.
     trajectory = BezierCurve(1)
     plan = trajectory.plan([[1.0]], 10, [0.0])
-    omega, residuals = trajectory.fit(plan, np.array([3, 0, 9]), np.array([7, 1, 10]), np.zeros(1))
+    omega, residuals = trajectory.fit(plan, np.array([3, 0, 9]), np.array([7, 1, 10]), np.array([[0.3], [0.0], [0.9]]))
     np.testing.assert_allclose(omega[:, 0, 0], [0.7, 0.1, 1.0])
     np.testing.assert_allclose(residuals, 0.0, atol=1e-12)
 
@@ -142,9 +142,9 @@ def test_stretches_of_bezier_curves_are_exact(omega, start, stretches):
     plan = trajectory.plan(omega, 30, start)
     firsts, lengths = np.array(stretches).T
     ends = np.minimum(firsts + lengths, 30)
-    fitted, residuals = trajectory.fit(plan, firsts, ends, start)
-    for first, end, weights, residual in zip(firsts, ends, fitted, residuals, strict=True):
-        before = plan[first - 1] if first else start
+    starts = np.vstack([start, plan])[firsts]
+    fitted, residuals = trajectory.fit(plan, firsts, ends, starts)
+    for first, end, before, weights, residual in zip(firsts, ends, starts, fitted, residuals, strict=True):
         played = trajectory.plan(weights, end - first, before)
         assert np.abs(played - plan[first:end]).max() == pytest.approx(residual, abs=1e-12)
         if end - first >= omega.shape[1]:
@@ -451,7 +451,7 @@ def test_the_controller_plays_what_the_wrapper_does(random_walk_env, kind, traje
     expected = through_wrapper(model, random_walk_env(kind), 50)
     assert np.ptp(expected) > 0.5
     np.testing.assert_array_equal(through_controller(OptionController(model), random_walk_env(kind), 50), expected)
-    by_clock = through_controller(OptionController(model), random_walk_env(kind), 50, clock=True)
+    by_clock = through_controller(OptionController(model, safety=None), random_walk_env(kind), 50, clock=True)
     np.testing.assert_allclose(by_clock, expected, atol=1e-5)
 
 
@@ -494,7 +494,7 @@ def test_a_clock_with_fine_ticks_sends_no_jumps(random_walk_env):
     obs, _ = random_walk_env().reset(seed=0)
     jumps = {}
     for ticks_per_step in (10, 20, 40):
-        controller = OptionController(model, dt=0.1 / ticks_per_step)
+        controller = OptionController(model, dt=0.1 / ticks_per_step, safety=None)
         actions = [controller(obs, now=i * controller.dt) for i in range(20 * ticks_per_step)]
         jumps[ticks_per_step] = largest_jump(np.array(actions) / 2.0)
     assert jumps[20] == pytest.approx(jumps[10] / 2, rel=0.15)

@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 from gymnasium import spaces
 
-from sb3_ctco.wrappers import OptionExecutionWrapper, RealTimeWrapper
+from sb3_ctco.options import integrated_reward
+from sb3_ctco.wrappers import OptionExecutionWrapper, RealTimeOptionWrapper, RealTimeWrapper
 
 
 class FakeClock:
@@ -198,8 +199,105 @@ def test_an_environment_without_a_period_is_refused():
         RealTimeWrapper(env)
 
 
-def test_options_in_real_time_have_no_sub_options(scripted_env):
-    from sb3_ctco.wrappers import RealTimeOptionWrapper
+TAU = 0.7
 
-    with pytest.raises(ValueError, match="n_sub_options=4"):
-        RealTimeOptionWrapper(scripted_env(), n_sub_options=4)
+
+def played_in_real_time(env, n_options, rng):
+    """Random options, some of them broken off, with what the environment did from one decision to the next."""
+    env.reset(seed=0)
+    first = 0
+    for _ in range(n_options):
+        option = rng.uniform(-1.0, 1.0, 4).astype(np.float32)
+        *_, terminated, truncated, info = env.step(option)
+        last = first + info["option"]["n_steps"]
+        yield option, first, last, terminated, truncated, info
+        first = last
+        if terminated or truncated:
+            env.reset()
+            first = 0
+
+
+@pytest.mark.parametrize("background", [False, True])
+@pytest.mark.parametrize("ahead", [0, 2])
+@pytest.mark.parametrize("breaks_off", [False, True])
+def test_sub_options_in_real_time(scripted_env, ahead, breaks_off, background):
+    """Each one is what it would have been to decide on it: on its observation, ``ahead`` steps before it plays."""
+    interrupt = (lambda decided_on, obs, seconds: obs[0] % 11 == 0) if breaks_off else None
+    inner = scripted_env(rewards=lambda step, action: np.sin(step), truncate_at=40)
+    env = RealTimeOptionWrapper(
+        inner,
+        ahead * 0.1,
+        interrupt,
+        background,
+        n_rbf=3,
+        d_max=1.5,
+        discount_rate=TAU,
+        n_sub_options=8,
+        sub_option_tolerance=2.0,
+    )
+    count = at_end = 0
+    for option, first, last, _, truncated, info in played_in_real_time(env, 100, np.random.default_rng(0)):
+        sub = info["sub_options"]
+        plan = env.option_space.plan(option.astype(np.float64))
+        for i in range(len(sub)):
+            begin, end = int(sub.observations[i][0]), int(sub.next_observations[i][0])
+            assert first <= begin < end <= last
+            rewards = np.sin(np.arange(begin, end))
+            assert sub.durations[i] == pytest.approx((end - begin) * 0.1)
+            assert sub.integrated_rewards[i] == pytest.approx(integrated_reward(rewards, 0.1, TAU), abs=1e-9)
+            assert sub.truncated[i] == (truncated and end == last)
+            fitted = env.option_space.plan(sub.options[i].astype(np.float64))
+            assert np.abs(fitted - plan[begin - first : end - first]).max() == pytest.approx(sub.residuals[i], abs=1e-6)
+            count += 1
+            at_end += bool(sub.truncated[i])
+    env.close()
+    assert count > 200
+    assert at_end > 5
+
+
+def test_what_a_sub_option_stands_for_was_played_so_much_later(scripted_env):
+    """An option of steps 0, 1, 2, …: decided on at step k, it plays what was sent at k + ahead."""
+    env = RealTimeOptionWrapper(scripted_env(), 0.2, n_rbf=1, d_max=1.0, n_sub_options=20)
+    env.reset(seed=0)
+    env.step([0.1, 1.0])  # begins at once, and leaves two steps to play
+    assert env.unwrapped.count == 8
+    *_, info = env.step([0.5, 1.0])
+    sent = np.ravel(env.unwrapped.actions)
+    np.testing.assert_allclose(sent[8:18], [0.1] * 2 + [0.5] * 8, rtol=1e-6)
+    assert len(info["sub_options"]) > 5
+    np.testing.assert_allclose(info["sub_options"].options[:, 0], 0.5, rtol=1e-6)
+    for begin, end in zip(info["sub_options"].observations[:, 0], info["sub_options"].next_observations[:, 0], strict=True):
+        played = sent[int(begin) + 2 : int(end) + 2]
+        np.testing.assert_allclose(played, 0.5, rtol=1e-6)  # as far as it was played until now
+
+
+@pytest.mark.parametrize("ahead", [0, 3])
+def test_with_continuous_joins_sub_options_leave_from_the_action_before_them(scripted_env, ahead):
+    """The one that is being sent when they begin to play, ``ahead`` steps after their observation."""
+    env = RealTimeOptionWrapper(
+        scripted_env(),
+        ahead * 0.1,
+        n_rbf=2,
+        d_max=1.0,
+        trajectory="bezier",
+        n_sub_options=8,
+        sub_option_tolerance=2.0,
+        join="continuous",
+    )
+    env.reset(seed=0)
+    rng = np.random.default_rng(0)
+    found = []
+    for k in range(30):
+        sub = env.step(rng.uniform(-1.0, 1.0, 3))[-1]["sub_options"]
+        # The first option begins at once, and tells nothing of those that are decided on ahead.
+        assert k > 0 or not ahead or not len(sub)
+        found += zip(sub.observations, sub.next_observations, sub.options.astype(np.float64), sub.residuals, strict=True)
+    env.step([0.0, 0.0, -1.0])  # sends the rest
+    sent = np.concatenate([[0.0], np.ravel(env.unwrapped.actions)])
+    assert len(found) > 50
+    for one, after, option, residual in found:
+        first, end = int(one[0]) + ahead, int(after[0]) + ahead
+        assert (one[-1], after[-1]) == pytest.approx((sent[first], sent[end]), abs=1e-6)
+        again = env.option_space.plan(option, one[-1:].astype(np.float64))[:, 0]
+        assert np.abs(again - sent[first + 1 : end + 1]).max() == pytest.approx(residual, abs=2e-6)
+        assert residual < 1e-5

@@ -5,6 +5,7 @@ from sb3_ctco.wrappers.real_time import Clock, RealTimeWrapper, SupportsSendRece
 from sb3_ctco.wrappers.real_time_options import Interrupt, RealTimeOptionWrapper
 from sb3_ctco.wrappers.reward_rate import RewardRateWrapper
 from sb3_ctco.wrappers.step_sequence import SupportsStepSequence
+from sb3_ctco.wrappers.take_over import TakeOver, TakeOverWrapper
 from sb3_ctco.wrappers.timing import find_dt
 
 __all__ = [
@@ -16,6 +17,8 @@ __all__ = [
     "RewardRateWrapper",
     "SupportsSendReceive",
     "SupportsStepSequence",
+    "TakeOver",
+    "TakeOverWrapper",
     "WallClock",
     "find_dt",
 ]

@@ -39,8 +39,9 @@ from sb3_ctco.wrappers.checks import check_observation, is_finite, reset_env
 from sb3_ctco.wrappers.step_sequence import SequenceResult, StepSequence, find_step_sequence
 from sb3_ctco.wrappers.timing import find_dt
 
-#: Where the loop over ``step`` leaves what it observed on the way, so that an environment's own infos stay
-_ON_THE_WAY = "_observations_on_the_way"
+#: Where the loop over ``step`` leaves what it observed on the way, and the actions sent just before, so that an environment's
+#: own infos stay
+ON_THE_WAY = "_observations_on_the_way"
 
 
 class OptionExecutionWrapper(gym.Wrapper, RecordConstructorArgs):
@@ -229,14 +230,18 @@ class OptionExecutionWrapper(gym.Wrapper, RecordConstructorArgs):
         before = self._last_action
         trajectory = space.plan(option.clip(-1.0, 1.0), before)
         n_steps = len(trajectory)
-        stretches = draw_stretches(self._stretch_rng, self.n_sub_options, n_steps, shortest_steps(space))
+        stretches = self._draw_stretches(n_steps)
         observe = sorted({k for ends in stretches for k in ends} - {0, n_steps})
         actions = self._box.actions(trajectory)
         obs, rewards, terminated, truncated, info = self._checked(play, actions, observe)
-        observations = info.pop(_ON_THE_WAY if _ON_THE_WAY in info else "observations", []) if observe else []
+        on_the_way: list[tuple[Any, Any]] = []
+        if observe and ON_THE_WAY in info:
+            on_the_way = info.pop(ON_THE_WAY)
+        elif observe:
+            on_the_way = list(zip(info.pop("observations", []), (actions[k - 1] for k in observe), strict=False))
         # Stacked, they are copies, too: the environment may overwrite its own.
-        seen = stack([self._last_obs, *observations, obs]) if self.n_sub_options else None
-        if len(observations) and not is_finite(seen):
+        seen = stack([self._last_obs, *(one for one, _ in on_the_way), obs]) if self.n_sub_options else None
+        if on_the_way and not is_finite(seen):
             raise ValueError(f"the environment {self.env} returned an observation that is not finite: {seen}")
         if not (terminated or truncated):
             self._play = play
@@ -244,7 +249,8 @@ class OptionExecutionWrapper(gym.Wrapper, RecordConstructorArgs):
         n_ran = len(rewards)
         last_action = self._keep_played(actions[:n_ran], info)
         if before is not None:
-            self._last_action = self._box.normalise([last_action])[0].clip(-1.0, 1.0)
+            sent = self._box.normalise([*(action for _, action in on_the_way), last_action]).clip(-1.0, 1.0)
+            self._last_action = sent[-1]
             obs = with_last_action(self.observation_space, obs, self._last_action)
         integral = integrated_reward(rewards, space.dt, space.discount_rate, self.reward_unit)
         info["option"] = OptionInfo(
@@ -254,12 +260,11 @@ class OptionExecutionWrapper(gym.Wrapper, RecordConstructorArgs):
             discount=math.exp(-space.discount_rate * n_ran * space.dt),
         )
         if seen is not None:
-            steps = [0, *observe[: len(observations)], n_ran]
+            steps = [0, *observe[: len(on_the_way)], n_ran]
             self._last_obs = rows_of(seen, -1)
-            if before is not None and self._last_action is not None:
-                on_the_way = self._box.normalise(actions[np.array(steps[1:-1], dtype=np.int64) - 1])
-                last_actions = np.vstack([before, on_the_way, self._last_action])
-                seen = with_last_action(self.observation_space, seen, last_actions)
+            if before is not None:
+                before = np.vstack([before, sent])
+                seen = with_last_action(self.observation_space, seen, before)
             played, ended = (trajectory, rewards, stretches, steps, seen), (terminated, truncated)
             info["sub_options"] = sub_options(space, *played, *ended, self.reward_unit, self.sub_option_tolerance, before)
         return obs, float(rewards.sum()) if self.reward == "sum" else integral, terminated, truncated, info
@@ -274,6 +279,9 @@ class OptionExecutionWrapper(gym.Wrapper, RecordConstructorArgs):
         if n_sub_options != self.n_sub_options:
             self.n_sub_options = n_sub_options
             self._play = None
+
+    def _draw_stretches(self, n_steps: int) -> list[tuple[int, int]]:
+        return draw_stretches(self._stretch_rng, self.n_sub_options, n_steps, shortest_steps(self.option_space))
 
     def _keep_played(self, actions: np.ndarray, info: dict[str, Any]) -> np.ndarray:
         """Keep the actions that were played, and tell the one that the next option leaves from."""
@@ -317,7 +325,7 @@ class OptionExecutionWrapper(gym.Wrapper, RecordConstructorArgs):
 
     def _step_in_a_loop(self, actions: np.ndarray, observe: Sequence[int] = ()) -> SequenceResult:
         rewards: list[float] = []
-        observations = []
+        on_the_way = []
         step = self.env.step
         # In stretches between the observations that are wanted, so that a step costs nothing more.
         for first, last in itertools.pairwise((0, *observe, len(actions))):
@@ -329,7 +337,7 @@ class OptionExecutionWrapper(gym.Wrapper, RecordConstructorArgs):
             if terminated or truncated:
                 break
             if last < len(actions):
-                observations.append(deepcopy(obs))
+                on_the_way.append(deepcopy((obs, info.get(LAST_ACTION, action))))
         if observe:
-            info[_ON_THE_WAY] = observations
+            info[ON_THE_WAY] = on_the_way
         return obs, rewards, terminated, truncated, info

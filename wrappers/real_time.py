@@ -4,12 +4,15 @@ import logging
 import math
 import time
 from dataclasses import dataclass
-from typing import Any, Protocol, SupportsFloat, runtime_checkable
+from typing import Any, Literal, Protocol, SupportsFloat, runtime_checkable
 
 import gymnasium as gym
 from gymnasium.utils import RecordConstructorArgs
 
+from sb3_ctco.options import LAST_ACTION
+from sb3_ctco.safety import Guard, Safety
 from sb3_ctco.wrappers.checks import reset_env
+from sb3_ctco.wrappers.take_over import TAKEN_OVER
 from sb3_ctco.wrappers.timing import find_dt
 
 logger = logging.getLogger(__name__)
@@ -56,12 +59,14 @@ class TickStatistics:
     :param late_ticks: those that were sent later than that by more than the tolerance
     :param worst_lateness: of any tick, in s
     :param total_lateness: of the late ticks, in s
+    :param safe_ticks: commands that were replaced by the safe action
     """
 
     ticks: int = 0
     late_ticks: int = 0
     worst_lateness: float = 0.0
     total_lateness: float = 0.0
+    safe_ticks: int = 0
 
     def add(self, lateness: float, tolerance: float) -> None:
         """Account for a tick that was late by so many seconds."""
@@ -86,15 +91,29 @@ class RealTimeWrapper(gym.Wrapper, RecordConstructorArgs):
     clock was set back: then it starts anew, because commands in quick succession do a machine no good, and to wait until the
     old time comes again no better.
 
+    Commands to a machine are guarded (:class:`~sb3_ctco.safety.Safety`): their changes are limited, and the safe action takes
+    the place of one that is not finite, or that was decided on without a fresh observation. ``receive`` tells the age of
+    its observation, in s, as ``info["observation_age"]``, if it may be old, and ``reset`` may tell the action that is being
+    sent as ``info["last_action"]``, as each guarded step does. A step with the safe action has ``info["interrupted"]`` and
+    ``info["taken_over"]``, so that it ends an option, and is no transition of the policy.
+
     :param env: the environment
     :param dt: the period, in s; by default what :func:`~sb3_ctco.wrappers.find_dt` finds
     :param clock: :class:`WallClock` by default
     :param tolerance: how late a command may be, in s, before it counts
+    :param safety: how commands are guarded; by default ``Safety()`` for a machine, and not at all for a simulation
     :raises ValueError: if dt is not given and not found, or a number is out of range
     """
 
-    def __init__(self, env: gym.Env, dt: float | None = None, clock: Clock | None = None, tolerance: float = 1e-3):
-        RecordConstructorArgs.__init__(self, dt=dt, clock=clock, tolerance=tolerance, _disable_deepcopy=True)
+    def __init__(
+        self,
+        env: gym.Env,
+        dt: float | None = None,
+        clock: Clock | None = None,
+        tolerance: float = 1e-3,
+        safety: Safety | Literal["machine"] | None = "machine",
+    ):
+        RecordConstructorArgs.__init__(self, dt=dt, clock=clock, tolerance=tolerance, safety=safety, _disable_deepcopy=True)
         gym.Wrapper.__init__(self, env)
         dt = find_dt(env, required_by="RealTimeWrapper") if dt is None else dt
         if not (dt > 0 and math.isfinite(dt)):
@@ -110,13 +129,25 @@ class RealTimeWrapper(gym.Wrapper, RecordConstructorArgs):
         self._due: float | None = None
         # Found once: to look for a protocol's methods takes as long as a cheap step.
         self._machine = env if isinstance(env, SupportsSendReceive) else None
+        if safety == "machine":
+            safety = None if self._machine is None else Safety()
+        space: Any = env.action_space
+        #: What guards commands; None if nothing does
+        self.guard = None if safety is None else Guard(safety, space.low, space.high)
+        #: Why the safe action is to be sent, whatever is decided; None if it is not. For whoever watches the loop
+        self.alarm: str | None = None
+        self._observation_age = 0.0
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
         """Reset the environment; the clock starts with the first command."""
         self._log()
         self.statistics = TickStatistics()
         self._due = None
-        return reset_env(self.env, seed, options)
+        obs, info = reset_env(self.env, seed, options)
+        self._observation_age = 0.0
+        if self.guard is not None:
+            self.guard.start(info.get(LAST_ACTION))
+        return obs, info
 
     def step(self, action: Any) -> tuple[Any, SupportsFloat, bool, bool, dict[str, Any]]:
         """Send a command and return what is observed one period later."""
@@ -131,6 +162,12 @@ class RealTimeWrapper(gym.Wrapper, RecordConstructorArgs):
         # Whole periods that were lost are not made up for.
         self._due = (now if lateness >= self.dt else self._due) + self.dt
 
+        replaced = False
+        if self.guard is not None:
+            action = self.guard.command(action, self.dt, self._observation_age, self.alarm)
+            replaced = self.guard.is_safe_action
+            self.statistics.safe_ticks += replaced
+            self.total_statistics.safe_ticks += replaced
         if self._machine is not None:
             self._machine.send(action)
             self._wait()
@@ -138,7 +175,13 @@ class RealTimeWrapper(gym.Wrapper, RecordConstructorArgs):
         else:
             obs, reward, terminated, truncated, info = self.env.step(action)
             self._wait()
-        return obs, reward, terminated, truncated, {**info, "real_time": {"lateness": lateness}}
+        self._observation_age = info.get("observation_age", 0.0)
+        info = {**info, "real_time": {"lateness": lateness}}
+        if self.guard is not None:
+            info = {LAST_ACTION: action, **info}
+        if replaced:
+            info |= {"interrupted": True, TAKEN_OVER: True}
+        return obs, reward, terminated, truncated, info
 
     def close(self) -> None:
         """Log the last episode's late ticks and close the environment."""
@@ -155,6 +198,9 @@ class RealTimeWrapper(gym.Wrapper, RecordConstructorArgs):
 
     def _log(self) -> None:
         s = self.statistics
+        if s.safe_ticks and self.guard is not None:
+            logger.warning("the safe action was sent %d times: %s", s.safe_ticks, dict(self.guard.replaced))
+            self.guard.replaced.clear()
         if s.late_ticks:
             logger.warning(
                 "%d of %d ticks were late by more than %.1f ms: by %.1f ms on average, %.1f ms at worst (period %.1f ms)",

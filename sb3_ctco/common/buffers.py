@@ -219,11 +219,10 @@ class _OptionStorage(ReplayBuffer):
             )
         rewards = np.asarray(rewards, dtype=np.float64)
         plan = ActionBox(self.primitive_action_space.low, self.primitive_action_space.high).normalise(actions)
-        before: list[np.ndarray | None] = [None] * len(plan)
+        sent = None
         if space.joined:
             # As an episode begins: with the middle of the box
             sent = np.vstack([np.zeros((1, plan.shape[1])), plan])
-            before = list(sent)
             observations = with_last_action(self.observation_space, observations, _as_many(sent, observations))
         seen = _recorded(observations, self.observation_space)
         _check_recorded(seen, plan, rewards)
@@ -241,7 +240,8 @@ class _OptionStorage(ReplayBuffer):
             window, rows = slice(first, end), slice(first, end + 1)
             played = (plan[window], rewards[window], stretches, list(range(end - first + 1)), rows_of(seen, rows))
             ended = (terminated and end == n_steps, truncated and end == n_steps)
-            parts.append(sub_options(space, *played, *ended, reward_unit, tolerance, before[first]))
+            before = None if sent is None else sent[rows]
+            parts.append(sub_options(space, *played, *ended, reward_unit, tolerance, before))
         added = sum(map(len, parts))
         if self.n_demonstrations + added >= self.buffer_size:
             raise ValueError(

@@ -157,17 +157,16 @@ class OptionSpace:
         """
         return option[:-1].reshape(-1, self.trajectory.n_weights), steps_in(self.duration(option), self.dt)
 
-    def stretch(self, plan: FloatArray, first: int, end: int, before: FloatArray | None = None) -> tuple[FloatArray, float]:
-        """The option that comes closest to a stretch of a plan.
+    def closest(self, plan: FloatArray, before: FloatArray | None = None) -> tuple[FloatArray, float]:
+        """The option that comes closest to a plan.
 
         :param plan: normalised actions, shape ``[n_steps, action_dim]``
-        :param first: the first step of the stretch
-        :param end: the step after its last
-        :param before: with a continuous join the action from which the plan leaves, normalised
+        :param before: with a continuous join the action from which it leaves, normalised, shape ``[action_dim]``
         :return: the option vector, float32, and the largest deviation of its actions from the plan
         """
-        omega, residuals = self.trajectory.fit(plan, np.array([first]), np.array([end]), before)
-        return self.encode(omega, np.array([end - first]))[0], float(residuals[0])
+        ends = np.array([len(plan)])
+        omega, residuals = self.trajectory.fit(plan, np.array([0]), ends, None if before is None else before[None])
+        return self.encode(omega, ends)[0], float(residuals[0])
 
     def plan(self, option: FloatArray, before: FloatArray | None = None) -> FloatArray:
         """All actions of an option, normalised.

@@ -1,0 +1,90 @@
+"""Somebody else acts for a while: what is sent, recorded and stored."""
+
+import numpy as np
+import pytest
+
+from sb3_ctco.wrappers import RealTimeOptionWrapper, TakeOverWrapper
+
+
+def between(first, last):
+    """Somebody who acts, by commands of −0.5, on the observations of the steps from ``first`` on and before ``last``."""
+    return lambda obs: np.array([-0.5]) if first <= obs[0] < last else None
+
+
+def make_env(scripted_env, take_over, join="free", **kwargs):
+    recorded = []
+    inner = TakeOverWrapper(scripted_env(rewards=lambda step, action: float(step), **kwargs), take_over, recorded.append)
+    env = RealTimeOptionWrapper(inner, n_rbf=1, d_max=1.0, join=join)
+    env.reset(seed=0)
+    return env, recorded
+
+
+def test_control_passes_between_options(scripted_env):
+    """Options of 10 steps of 0.25; somebody takes over after 4, for 13 steps."""
+    env, recorded = make_env(scripted_env, between(4, 17))
+    options = []
+    for _ in range(5):
+        obs, _, _, _, info = env.step([0.25, 1.0])
+        options.append((info["option"]["n_steps"], "taken_over" in info, int(obs[0])))
+    # The option ends where they take over; those that they play through are theirs; the one after it is whole again.
+    assert options == [(4, False, 4), (10, True, 14), (3, True, 17), (10, False, 27), (10, False, 37)]
+    assert np.ravel(env.unwrapped.actions).tolist() == [0.25] * 4 + [-0.5] * 13 + [0.25] * 20
+    (trajectory,) = recorded
+    np.testing.assert_array_equal(trajectory.observations[:, 0], np.arange(4, 18))
+    np.testing.assert_array_equal(trajectory.actions, np.full((13, 1), -0.5))
+    np.testing.assert_array_equal(trajectory.rewards, np.arange(4, 17))
+    assert (trajectory.terminated, trajectory.truncated, trajectory.dt) == (False, False, 0.1)
+
+
+@pytest.mark.parametrize("end", [{"terminate_at": 6}, {"truncate_at": 6}])
+def test_an_episode_that_ends_meanwhile(scripted_env, end):
+    env, recorded = make_env(scripted_env, between(3, 100), **end)
+    for _ in range(2):
+        env.step([0.25, 1.0])
+    env.reset()
+    env.step([0.25, 1.0])
+    env.close()
+    (trajectory,) = recorded  # the second episode's has no step
+    np.testing.assert_array_equal(trajectory.observations[:, 0], [3, 4, 5, 6])
+    assert (trajectory.terminated, trajectory.truncated) == ("terminate_at" in end, "truncate_at" in end)
+
+
+def test_a_reset_in_the_middle_hands_over_what_there_is(scripted_env):
+    env, recorded = make_env(scripted_env, between(0, 100))
+    env.step([0.25, -0.5])
+    env.reset()
+    env.step([0.25, -1.0])
+    env.close()
+    assert [len(trajectory.actions) for trajectory in recorded] == [3, 1]
+
+
+def test_commands_stay_in_their_bounds(scripted_env):
+    env, recorded = make_env(scripted_env, lambda obs: [7])
+    env.step([0.25, -1.0])
+    env.close()
+    np.testing.assert_array_equal(recorded[0].actions, [[1.0]])
+    assert recorded[0].actions.dtype == np.float32
+
+
+def test_deciding_ahead(scripted_env):
+    """The rest of an option that plays while the next is decided on is broken off, too."""
+    recorded = []
+    inner = TakeOverWrapper(scripted_env(), between(9, 15), recorded.append)
+    env = RealTimeOptionWrapper(inner, n_rbf=1, d_max=1.0, decide_ahead=0.2)
+    env.reset(seed=0)
+    options = []
+    for _ in range(3):
+        *_, info = env.step([0.25, 1.0])
+        options.append((info["option"]["n_steps"], "taken_over" in info))
+    assert options == [(8, False), (1, False), (6, True)]
+    assert len(recorded[0].actions) == 6
+
+
+def test_with_a_continuous_join_control_comes_back_where_it_was_given(scripted_env):
+    env, _ = make_env(scripted_env, between(4, 8), join="continuous")
+    for last_action in (0.1, -0.5):
+        obs, *_, info = env.step([0.25, 1.0])
+        assert obs[-1] == pytest.approx(last_action)
+        assert info["option"]["n_steps"] == 4
+    # A tenth of the way from −0.5 to 0.25 with each step
+    np.testing.assert_allclose(env.plan([0.25, 1.0])[:2, 0], [-0.425, -0.35], atol=1e-6)
