@@ -13,7 +13,7 @@ from gymnasium.utils import RecordConstructorArgs
 from stable_baselines3.common.env_util import unwrap_wrapper
 
 from sb3_ctco.option_array import plain
-from sb3_ctco.options import LAST_ACTION, PLAYED, ValueInterrupt, shortest_steps, stack, with_last_action
+from sb3_ctco.options import LAST_ACTION, PLAYED, FloatArray, ValueInterrupt, shortest_steps, stack, with_last_action
 from sb3_ctco.wrappers.option_execution import ON_THE_WAY, OptionExecutionWrapper
 from sb3_ctco.wrappers.real_time import RealTimeWrapper
 from sb3_ctco.wrappers.step_sequence import SequenceResult, StepSequence
@@ -134,7 +134,7 @@ class RealTimeOptionWrapper(OptionExecutionWrapper):
 
     def step(self, action: npt.ArrayLike) -> tuple[Any, SupportsFloat, bool, bool, dict[str, Any]]:
         """Play one option, or what is due of it and of the one before."""
-        option = np.asarray(plain(action), dtype=np.float64)
+        option: FloatArray = np.asarray(plain(action), dtype=np.float64)
         self._is_lost = self._is_guarded and not np.isfinite(option).all()
         before = self._last_action
         # In place of one that is lost the shortest one, whose actions the guard replaces.
@@ -196,7 +196,8 @@ class RealTimeOptionWrapper(OptionExecutionWrapper):
         # A sub-option that was decided on after k steps of this time would play as this option does from its step k on.
         on_the_way = result[4].pop(ON_THE_WAY)
         if observe:
-            seen = [(k, *on_the_way[k - 1]) for k in observe if k < len(result[1])]
+            n_ran = len(np.asarray(result[1]))
+            seen = [(k, *on_the_way[k - 1]) for k in observe if k < n_ran]
             # With decide_ahead it would leave from an action that was still to be sent then.
             result[4][ON_THE_WAY] = [(obs, plan[k - 1] if self._ahead_steps else sent) for k, obs, sent in seen]
         if not over and n_now < len(plan):
