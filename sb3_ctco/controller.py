@@ -523,7 +523,7 @@ class OptionController:
         if not self._executions:
             several = self.settings.joined and self._are_several(observation)
             n = len(_first_leaf(observation)) if several else 1
-            options = self._ask(observation, self._firsts(n), several)
+            options = self._ask(observation, self._firsts(n) if self.settings.joined else [], several)
             self._several = options.ndim == 2
             options = np.atleast_2d(options)
             self._executions = [self._begin(*both, now) for both in zip(options, self._firsts(len(options)), strict=True)]

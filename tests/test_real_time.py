@@ -236,7 +236,7 @@ def test_sub_options_in_real_time(scripted_env, ahead, breaks_off, background):
         sub_option_tolerance=2.0,
     )
     count = at_end = 0
-    for option, first, last, _, truncated, info in played_in_real_time(env, 100, np.random.default_rng(0)):
+    for option, first, last, _, truncated, info in played_in_real_time(env, 250, np.random.default_rng(0)):
         sub = info["sub_options"]
         plan = env.option_space.plan(option.astype(np.float64))
         for i in range(len(sub)):

@@ -106,6 +106,8 @@ def test_replayed_a_sub_option_lands_in_the_same_state():
                 base._data.qpos[:], base._data.qvel[:] = state[:2], state[2:]
             obs, _, _, _, info = again.step(sub.options[i])
             assert info["option"]["duration"] == pytest.approx(sub.durations[i])
+            if np.abs([obs[:2], sub.next_observations[i][:2]]).max() > 0.28:
+                continue  # a wall is no free flight
             # A control of 1 accelerates the mass by 1/3 m/s², so one that is off by the residual for d changes the
             # velocity by residual·d/3, and the position, d being below 1 s, by less.
             bound = sub.residuals[i] * sub.durations[i] / 3 + 1e-5
