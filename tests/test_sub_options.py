@@ -98,7 +98,7 @@ def test_replayed_a_sub_option_lands_in_the_same_state():
     again = OptionExecutionWrapper(gym.make("sb3_ctco/point_mass-easy-v0", dt=0.01, time_limit=1e6), d_max=0.5)
     again.reset(seed=0)
     errors, moved = [], []
-    for sub, *_ in itertools.islice(play(env), 40):
+    for sub, *_ in itertools.islice(play(env), 60):
         for i in range(len(sub)):
             state = np.asarray(sub.observations[i], dtype=np.float64)
             base = again.unwrapped
