@@ -1,10 +1,11 @@
-"""A target that moves faster than it did in training: options that are played to their end, and options broken off.
+"""A target that moves faster than it did in training: options that are played to their end, and options that are broken off.
 
     python benchmarks/interruption.py
 
 A point is to stay near a target. CTCO learns with a target that stands still; then the target moves, and the greedy policy
-plays its options whole, or has them broken off as soon as the target is 0.1 from where it was at the decision. The
-paper's section on limitations says that the first fails if the target is too fast.
+plays its options whole; has them broken off as soon as the target is 0.1 from where it was at the decision; or has its
+critics end them, asked every 0.1 s, when to decide anew is worth more than the rest of the plan. The paper's section on
+limitations says that the first fails if the target is too fast.
 """
 
 import argparse
@@ -17,11 +18,14 @@ from gymnasium import spaces
 
 from sb3_ctco import CTCO
 from sb3_ctco.evaluation import evaluate_discounted_return
+from sb3_ctco.interruption import CriticInterrupt
 from sb3_ctco.wrappers import RealTimeOptionWrapper
 
 SPEEDS = (0.0, 0.1, 0.2, 0.4, 0.8)
 #: How far the target must have moved to end an option
 DISTANCE = 0.1
+#: How often the critics are asked, in s
+CHECK_PERIOD = 0.1
 
 
 class MovingTarget(gym.Env):
@@ -68,10 +72,11 @@ def main() -> None:
     parser.add_argument("--seeds", type=int, default=3)
     parser.add_argument("--seconds", type=float, default=1200.0, help="task time of a training")
     parser.add_argument("--episodes", type=int, default=50, help="of an evaluation")
+    parser.add_argument("--margin", type=float, default=0.0, help="how much more it must be worth to decide anew, beside β_h")
     args = parser.parse_args()
     th.set_num_threads(1)
     options: dict[str, Any] = {"n_rbf": 2, "d_max": 2.0}
-    results = np.zeros((args.seeds, len(SPEEDS), 2, 2))
+    results = np.zeros((args.seeds, len(SPEEDS), 3, 2))
     for seed in range(args.seeds):
         model = CTCO(
             "MlpPolicy",
@@ -88,13 +93,14 @@ def main() -> None:
             **options,
         ).learn(round(args.seconds / MovingTarget.dt))
         for i, speed in enumerate(SPEEDS):
-            for j, interrupt in enumerate((None, target_moved)):
+            for j, interrupt in enumerate((None, target_moved, CriticInterrupt(model, CHECK_PERIOD, args.margin))):
                 env = RealTimeOptionWrapper(MovingTarget(speed), interrupt=interrupt, **options)
                 env.reset(seed=1000)  # the same first states for each
                 episodes = evaluate_discounted_return(model, env, args.episodes)
                 results[seed, i, j, 0] = np.mean([episode.discounted_return for episode in episodes])
                 results[seed, i, j, 1] = np.mean([episode.decision_rate_hz for episode in episodes])
-    print("| speed of the target [1/s] | options whole | decisions/s | broken off | decisions/s |\n|---|---|---|---|---|")
+    ways = ("options whole", "broken off by a rule", "ended by the critics")
+    print(f"| speed of the target [1/s] | {' | '.join(f'{way} | decisions/s' for way in ways)} |\n|{'---|' * 7}")
     for speed, seeds in zip(SPEEDS, results.transpose(1, 2, 0, 3), strict=True):
         cells = [f"{v[:, 0].mean():.2f} ({v[:, 0].min():.2f} to {v[:, 0].max():.2f}) | {v[:, 1].mean():.1f}" for v in seeds]
         print(f"| {speed} | {' | '.join(cells)} |")

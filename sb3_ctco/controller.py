@@ -4,6 +4,7 @@ import json
 import logging
 import math
 import pickle
+import sys
 import zipfile
 from collections import Counter
 from collections.abc import Sequence
@@ -15,7 +16,17 @@ import numpy as np
 import numpy.typing as npt
 from gymnasium import spaces
 
-from sb3_ctco.options import ActionBox, OptionSpace
+from sb3_ctco.options import (
+    LAST_ACTION,
+    OBSERVATION,
+    ActionBox,
+    OptionSpace,
+    ValueInterrupt,
+    shortest_steps,
+    stack,
+    steps_in,
+    with_last_action,
+)
 from sb3_ctco.safety import Guard, Safety
 
 if TYPE_CHECKING:
@@ -32,10 +43,15 @@ METADATA_KEY = "sb3_ctco"
 
 
 class OptionPolicy(Protocol):
-    """What :class:`OptionController` needs of a policy: a function from observations to options, and their meaning."""
+    """What :class:`OptionController` needs of a policy: a function from observations to options, and their meaning.
+
+    With a continuous join, observations hold the action that is being sent, and the space that they are then in is
+    ``observation_space``.
+    """
 
     option_space: OptionSpace
     primitive_action_space: spaces.Box
+    observation_space: spaces.Space
 
     def __call__(self, observation: Observation) -> np.ndarray:
         """Options for one observation, shape ``[option_dim]``, or for several, ``[n, option_dim]``."""
@@ -70,6 +86,7 @@ class ModelPolicy:
             )
         self.option_space = model.option_space
         self.primitive_action_space = model.primitive_action_space
+        self.observation_space = model.observation_space
         self.deterministic = deterministic
         self.vec_normalize = model.get_vec_normalize_env() if vec_normalize is None else vec_normalize
         self.model = model
@@ -115,6 +132,7 @@ class OnnxPolicy:
         try:
             self.option_space, self.primitive_action_space, self._observations = _from_metadata(metadata[METADATA_KEY])
             _check_graph(self._session, self.option_space, self.primitive_action_space, self._observations)
+            self.observation_space = _observation_space(self._observations)
         except (AttributeError, KeyError, TypeError, ValueError, RecursionError) as error:
             raise ValueError(
                 f"the metadata of {path} are not those of an exported policy ({type(error).__name__}: {error}): write it anew "
@@ -170,8 +188,10 @@ _SETTINGS: dict[str, tuple[type, ...]] = {
     "dt": (int, float),
     "discount_rate": (int, float),
     "duration_scale": (str,),
+    "join": (str,),
 }
-_OF_0_1_0 = {"trajectory": "rbf", "duration_scale": "linear"}
+#: Of files that do not say so
+_OF_0_1_0 = {"trajectory": "rbf", "duration_scale": "linear", "join": "free"}
 
 #: Name of a dtype of numbers, as numpy has it, and what ONNX calls it
 _ONNX_TYPES = {
@@ -189,8 +209,9 @@ def _from_metadata(text: str) -> tuple[OptionSpace, spaces.Box, dict[str, tuple[
     :raises ValueError: if a value is out of its range, or malformed; likewise KeyError and TypeError
     """
     data = json.loads(text)
-    # Files that 0.1.0 wrote have it under another name, and no trajectory and scale, which were these.
-    settings = data["option_space"] if "option_space" in data else {**data["option_settings"], **_OF_0_1_0}
+    # Files that 0.1.0 wrote have it under another name.
+    settings = data["option_space"] if "option_space" in data else data["option_settings"]
+    settings = {**_OF_0_1_0, **settings} if isinstance(settings, dict) else settings
     if not isinstance(settings, dict) or settings.keys() != _SETTINGS.keys():
         raise ValueError(f"option_space must have {list(_SETTINGS)}, not {settings}")
     for name, value in settings.items():
@@ -229,22 +250,42 @@ def _check_graph(
         raise ValueError(f"the graph's outputs are {outputs}, and options of these settings have {option_dim} numbers")
 
 
+def _observation_space(observations: dict[str, tuple[tuple[int, ...], str]]) -> spaces.Space:
+    """The space of an exported policy's observations: their shapes and types, whose bounds are all that these allow."""
+    boxes: dict[str, spaces.Space] = {}
+    for name, (shape, kind) in observations.items():
+        dtype: Any = np.dtype(kind)
+        low, high = {"f": (-np.inf, np.inf), "b": (0, 1)}.get(dtype.kind) or (np.iinfo(dtype).min, np.iinfo(dtype).max)
+        boxes[name] = spaces.Box(low, high, shape, dtype)
+    return spaces.Dict(boxes) if LAST_ACTION in boxes else next(iter(boxes.values()))
+
+
 @dataclass(slots=True)
 class _Execution:
     """An option in execution, or none yet (``n_steps`` of 0).
 
-    :param plan: its actions, if ticks come at a fixed rate
-    :param weights: ω in the units of the actions, ``[n_rbf, action_dim]``, if they come by a clock
+    :param n_steps: after how many it is time to decide
+    :param plan: its actions at a fixed rate
+    :param rows: likewise, one after the other
+    :param weights: ω in the units of the actions, ``[n_rbf, action_dim]``, if they come by a clock; with a continuous join the
+        action before is the first
+    :param before: the normalised action that it leaves from, with a continuous join
+    :param sent: the action of the last tick
     :param tick: how many of its ticks have passed
     :param start: when it began, by the caller's clock, in s
+    :param checked: after how many steps a ValueInterrupt was asked
     """
 
     option: np.ndarray
     n_steps: int
     plan: np.ndarray
+    rows: list[np.ndarray]
     weights: np.ndarray
+    before: np.ndarray | None
+    sent: np.ndarray
     tick: int = 0
     start: float = 0.0
+    checked: int = 0
 
 
 class OptionController:
@@ -285,10 +326,13 @@ class OptionController:
         own way
     :param vec_normalize: normalises observations as in training, or the path it was saved to; needed for a path to a
         ``.zip`` only, and only if training normalised observations
+    :param replan_period: decide anew after so many seconds at most, whatever the option's duration; never by default
+    :param interrupt: asked every ``check_period`` whether the rest of an option is worth playing, such as
+        :class:`~sb3_ctco.interruption.CriticInterrupt`
     :param safety: how ticks by a clock are guarded; None for not at all
     :raises TypeError: if the model decides by no options
-    :raises ValueError: if ``dt`` is not a positive number, the file is of another kind, or ``deterministic`` or
-        ``vec_normalize`` is given beside a policy that does not take it
+    :raises ValueError: if ``dt`` or ``replan_period`` is not a positive number, the file is of another kind, or
+        ``deterministic`` or ``vec_normalize`` is given beside a policy that does not take it
     :raises FileNotFoundError: if there is no such file
     """
 
@@ -298,13 +342,27 @@ class OptionController:
         dt: float | None = None,
         deterministic: bool = True,
         vec_normalize: "VecNormalize | str | Path | None" = None,
+        replan_period: float | None = None,
+        interrupt: ValueInterrupt | None = None,
         safety: Safety | None = Safety(),  # noqa: B008 (frozen)
     ):
+        if not (replan_period is None or replan_period > 0):
+            raise ValueError(f"replan_period must be a positive number of seconds or None, not {replan_period}")
+        if not (interrupt is None or isinstance(interrupt, ValueInterrupt)):
+            raise TypeError(
+                f"interrupt must be a ValueInterrupt such as CriticInterrupt(model, check_period=0.05), not {interrupt!r}: "
+                "to follow a rule of your own, call decide_anew()"
+            )
         self.policy = _as_policy(policy, deterministic, vec_normalize)
         trained = self.policy.option_space
         #: What options mean here: training's settings, at this controller's ``dt``.
         self.settings = trained if dt is None else replace(trained, dt=dt)
+        self._trajectory = self.settings.trajectory
         self._box = ActionBox(self.policy.primitive_action_space.low, self.policy.primitive_action_space.high)
+        self._middle = self._first = self._box.actions(np.zeros((1, self._box.low.size)))[0]
+        self._longest = sys.maxsize if replan_period is None else steps_in(replan_period, self.dt)
+        self._interrupt = interrupt
+        self._check_steps = 0 if interrupt is None else steps_in(interrupt.check_period, self.dt)
         self._executions: list[_Execution] = []
         self._several = False
         self._now: float | None = None
@@ -313,6 +371,7 @@ class OptionController:
         self._next = 0
         self.safety = safety
         self._guard: Guard | None = None
+        self._last_action: npt.NDArray[Any] | None = None
         self._observed_at = -math.inf
         self._sent_at: float | None = None
         #: How many ticks by a clock sent the safe action, by reason
@@ -323,21 +382,38 @@ class OptionController:
         """Time between two ticks, in s."""
         return self.settings.dt
 
-    def reset(self, which: Sequence[int] | npt.NDArray[Any] | None = None) -> None:
+    def reset(
+        self, which: Sequence[int] | npt.NDArray[Any] | None = None, last_action: npt.NDArray[Any] | None = None
+    ) -> None:
         """Forget the options that run, so that the next tick decides anew: at the start of each episode.
 
         :param which: with several observations, those to reset: their indices or a mask; all of them by default
+        :param last_action: the action that is being sent, from which the first option leaves with a continuous join; by
+            default the middle of the box, as in training
         """
-        self._rows, self._next = [], 0
+        first = self._middle if last_action is None else np.asarray(last_action, self._box.low.dtype)
         if which is None:
             self._executions = []
+            self._first, self._last_action = first, last_action
             self._now = self._sent_at = self._guard = None
             self._observed_at = -math.inf
-        if not self._executions:
-            return
-        indices = np.arange(len(self._executions))[np.asarray(which)]
-        for i in np.atleast_1d(indices):
-            self._executions[i].n_steps = 0
+        self._rows, self._next = [], 0
+        for execution in self._chosen(which):
+            execution.n_steps, execution.sent = 0, first
+
+    def decide_anew(self, which: Sequence[int] | npt.NDArray[Any] | None = None) -> None:
+        """Break the options off that run: the next tick decides anew, on from what is being sent.
+
+        :param which: with several observations, those whose options to break off; all of them by default
+        """
+        self._rows, self._next = [], 0
+        for execution in self._chosen(which):
+            execution.n_steps = 0
+
+    def _chosen(self, which: Sequence[int] | npt.NDArray[Any] | None) -> list[_Execution]:
+        if which is None or not self._executions:
+            return self._executions
+        return [self._executions[i] for i in np.atleast_1d(np.arange(len(self._executions))[np.asarray(which)])]
 
     def __call__(
         self, observation: Observation | None, now: float | None = None, observed_at: float | None = None
@@ -351,6 +427,8 @@ class OptionController:
         :raises ValueError: if ``now`` is not finite, runs backwards, or is given at some ticks and not at others; or if
             the number of observations changes without a reset
         """
+        if observation is None and (now is None or self.safety is None):
+            raise ValueError("a tick without an observation must be by a clock, now=..., and guarded, safety=Safety()")
         executions = self._executions
         if executions:
             if (now is None) != (self._now is None):
@@ -368,12 +446,17 @@ class OptionController:
 
         if self._next == len(self._rows):
             due = [i for i, e in enumerate(executions) if e.tick >= e.n_steps]
+            if self._interrupt is not None:
+                due = self._with_interrupted(observation, due, [e.tick for e in executions])
             if due or not executions:
                 self._decide(observation, due, 0.0)
-            n_ticks = min(e.n_steps - e.tick for e in self._executions)
-            plans = [e.plan[e.tick : e.tick + n_ticks] for e in self._executions]
-            self._rows, self._next = list(np.stack(plans, axis=1) if self._several else plans[0]), 0
-        for e in self._executions:
+                executions = self._executions
+            # Critics are asked in between.
+            n_ticks = 1 if self._interrupt is not None else min(e.n_steps - e.tick for e in executions)
+            plans = [e.rows[e.tick : e.tick + n_ticks] for e in executions]
+            self._rows, self._next = list(np.stack(plans, axis=1)) if self._several else plans[0], 0
+        for e in executions:
+            e.sent = e.rows[e.tick]
             e.tick += 1
         self._next += 1
         return self._rows[self._next - 1]
@@ -382,10 +465,11 @@ class OptionController:
         assert self.safety is not None
         if observation is not None:
             self._observed_at = now if observed_at is None else observed_at
-        age = now - self._observed_at
-        low, high = self._box.low, self._box.high
-        actions, reason = low, None if age <= self.safety.stale_after else "no fresh observation"
-        if reason is None:
+        actions, reason = self._box.low, None
+        is_broken_off = not self._executions or any(e.n_steps == 0 for e in self._executions)
+        if now - self._observed_at > self.safety.stale_after or (observation is None and is_broken_off):
+            reason = "no fresh observation"
+        else:
             try:
                 actions = self._at(observation, now)
             except Exception as error:  # the policy's own, of any kind
@@ -393,52 +477,108 @@ class OptionController:
                 if not (self._guard is not None and self._guard.is_safe_action):
                     logger.error("the policy failed: %s: %s", type(error).__name__, error)
         if self._guard is None or (reason is None and self._guard.low.shape != actions.shape):
-            self._guard = Guard(self.safety, np.broadcast_to(low, actions.shape), np.broadcast_to(high, actions.shape))
+            low, high = (np.broadcast_to(bound, actions.shape) for bound in (self._box.low, self._box.high))
+            self._guard = Guard(self.safety, low, high)
             self._guard.replaced = self.replaced
+            if self._last_action is not None:
+                self._guard.start(np.broadcast_to(self._last_action, actions.shape))
         seconds = self.dt if self._sent_at is None else now - self._sent_at
         self._now = self._sent_at = now
         command = self._guard.command(actions, seconds, reason=reason)
         if self._guard.is_safe_action:
-            self._executions = []  # Whatever comes next is decided anew.
+            self.decide_anew()
+        # From what is sent the next option leaves.
+        if not self._executions and command.shape == self._box.low.shape:
+            self._first = command
+        for i, e in enumerate(self._executions):
+            e.sent = command[i] if self._several else command
         return command
 
     def _at(self, observation: Observation | None, now: float) -> np.ndarray:
         dt = self.settings.dt
         due = [i for i, e in enumerate(self._executions) if now - e.start >= (e.n_steps - 0.5) * dt]
+        if self._interrupt is not None and observation is not None:
+            due = self._with_interrupted(observation, due, [round((now - e.start) / dt) for e in self._executions])
         # Without an observation an option holds its last action, as it does past its end at a late tick.
         if (due and observation is not None) or not self._executions:
             self._decide(observation, due, now)
         self._now = now
-        phases = np.array([min((now - e.start) / (e.n_steps * dt), 1.0) for e in self._executions])
-        features = self.settings.trajectory.basis(phases)
-        actions = self._box.cast(np.array([row.dot(e.weights) for row, e in zip(features, self._executions, strict=True)]))
+        # The action that an option leaves from is that of the tick before it.
+        lead, basis = (dt, self._trajectory.joined_basis) if self.settings.joined else (0.0, self._trajectory.basis)
+        phases = np.array([min((now - e.start + lead) / (len(e.plan) * dt), 1.0) for e in self._executions])
+        actions = self._box.cast(
+            np.array([row.dot(e.weights) for row, e in zip(basis(phases), self._executions, strict=True)])
+        )
+        for e, action in zip(self._executions, actions, strict=True):
+            e.sent = action
         return actions if self._several else actions[0]
 
     def _decide(self, observation: Observation | None, due: list[int], now: float) -> None:
-        if observation is None:
-            raise ValueError("the first tick, and each one at a fixed rate, needs an observation")
+        assert observation is not None  # see _guarded, which alone has none
         if not self._executions:
-            options = np.asarray(self.policy(observation))
+            several = self.settings.joined and self._are_several(observation)
+            sent = [self._first] * (len(_first_leaf(observation)) if several else 1)
+            options = self._ask(observation, sent, several)
             self._several = options.ndim == 2
-            self._executions = [self._begin(option, now) for option in np.atleast_2d(options)]
+            self._executions = [self._begin(option, self._first, now) for option in np.atleast_2d(options)]
             return
         if self._several and len(due) < len(self._executions):
-            if isinstance(observation, dict):
-                observation = {key: np.asarray(value)[due] for key, value in observation.items()}
-            else:
-                observation = np.asarray(observation)[due]
-        for i, option in zip(due, np.atleast_2d(self.policy(observation)), strict=True):
-            self._executions[i] = self._begin(option, now)
+            observation = _rows(observation, due)
+        sent = [self._executions[i].sent for i in due]
+        options = np.atleast_2d(self._ask(observation, sent, self._several))
+        for i, option, action in zip(due, options, sent, strict=True):
+            self._executions[i] = self._begin(option, action, now)
 
-    def _begin(self, option: np.ndarray, now: float) -> _Execution:
+    def _with_interrupted(self, observation: Observation | None, due: list[int], ran: list[int]) -> list[int]:
+        """Options that are due, and those whose rest is not worth playing.
+
+        :param ran: how many steps of each have been played
+        """
+        asked, rests = [], []
+        for i, (e, n_ran) in enumerate(zip(self._executions, ran, strict=True)):
+            if i in due or n_ran - e.checked < self._check_steps or len(e.plan) - n_ran < shortest_steps(self.settings):
+                continue
+            e.checked = n_ran
+            plan = self._box.normalise(e.plan)
+            rests.append(self.settings.stretch(plan, n_ran, len(plan), e.before)[0])
+            asked.append(i)
+        if not asked:
+            return due
+        assert self._interrupt is not None and observation is not None
+        seen: Any = _rows(observation, asked) if self._several else stack([observation])
+        seen = self._as_seen(seen, [self._executions[i].sent for i in asked], several=True)
+        worth_ending = self._interrupt.worth_ending(seen, np.array(rests))
+        return sorted([*due, *(i for i, ends in zip(asked, worth_ending, strict=True) if ends)])
+
+    def _ask(self, observation: Observation, sent: list[np.ndarray], several: bool) -> np.ndarray:
+        """Options for one or several observations, and the actions that are being sent."""
+        return np.asarray(self.policy(self._as_seen(observation, sent, several)))
+
+    def _as_seen(self, observation: Observation, sent: list[np.ndarray], several: bool) -> Observation:
+        """Observations as the policy sees them."""
+        if not self.settings.joined:
+            return observation
+        before = self._box.normalise(sent)
+        seen: Observation = with_last_action(self.policy.observation_space, observation, before if several else before[0])
+        return seen
+
+    def _are_several(self, observation: Observation) -> bool:
+        space: Any = self.policy.observation_space
+        if isinstance(space, spaces.Dict):
+            space = space[next(iter(observation)) if isinstance(observation, dict) else OBSERVATION]
+        return np.ndim(_first_leaf(observation)) > len(space.shape)
+
+    def _begin(self, option: np.ndarray, sent: np.ndarray, now: float) -> _Execution:
         # As OptionExecutionWrapper does, in the same precision.
         option = np.clip(option.astype(np.float64), -1.0, 1.0)
         if not np.isfinite(option).all():
             raise ValueError(f"the policy returned an option that is not finite: {option}")
         omega, n_steps = self.settings.decode(option)
-        plan = self._box.actions(self.settings.trajectory.plan(omega, n_steps))
+        start = self._box.normalise([sent])[0] if self.settings.joined else None
+        plan = self._box.actions(self._trajectory.plan(omega, n_steps, start))
         # Features sum to one, so that actions are the same combination of weights in their own units.
-        return _Execution(option, n_steps, plan, self._box.scale(omega.T), start=now)
+        weights = self._box.scale(omega.T if start is None else np.vstack([start, omega.T]))
+        return _Execution(option, min(n_steps, self._longest), plan, list(plan), weights, start, sent=plan[0], start=now)
 
     @property
     def option(self) -> np.ndarray:
@@ -469,6 +609,12 @@ class OptionController:
 
     def _for_each(self, values: list[Any]) -> Any:
         return np.stack(values) if self._several else values[0]
+
+
+def _rows(observation: Observation, rows: list[int]) -> Observation:
+    if isinstance(observation, dict):
+        return {key: np.asarray(value)[rows] for key, value in observation.items()}
+    return np.asarray(observation)[rows]
 
 
 def _first_leaf(observation: Observation) -> npt.NDArray[Any]:

@@ -13,7 +13,7 @@ from stable_baselines3.common.type_aliases import PolicyPredictor
 from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv
 
 from sb3_ctco.options import DEFAULT_DISCOUNT_RATE, discount, step_weight
-from sb3_ctco.vec_env import PENDING, PLAYED
+from sb3_ctco.vec_env import PENDING
 
 
 def mean_absolute_jerk(actions: npt.ArrayLike, dt: float) -> float:
@@ -54,6 +54,18 @@ def spectral_smoothness(actions: npt.ArrayLike) -> float:
     return float(2.0 / n * (amplitudes * relative_frequencies).sum(axis=0).mean())
 
 
+def largest_jump(actions: npt.ArrayLike) -> float:
+    """The largest change of an action from one step to the next, of any dimension.
+
+    It shrinks in proportion with dt where a signal is continuous, and stays where it jumps: compare at one dt.
+
+    :param actions: one action a step, normalised to [−1, 1], shape ``[n_steps, action_dim]``
+    :return: 0 to 2; nan for less than two steps
+    """
+    actions = np.asarray(actions, dtype=np.float64)
+    return float(np.abs(np.diff(actions, axis=0)).max()) if len(actions) > 1 else math.nan
+
+
 @dataclass
 class EpisodeStatistics:
     """What an episode was worth, and how it was played.
@@ -64,6 +76,7 @@ class EpisodeStatistics:
     :param episode_return: sum of the primitive rewards, from ``Monitor``; without one, of what ``step`` returned
     :param mean_absolute_jerk: of the primitive actions, see :func:`mean_absolute_jerk`; nan if not measured
     :param spectral_smoothness: likewise, see :func:`spectral_smoothness`
+    :param largest_jump: likewise, see :func:`largest_jump`
     """
 
     discounted_return: float = 0.0
@@ -72,6 +85,7 @@ class EpisodeStatistics:
     episode_return: float = 0.0
     mean_absolute_jerk: float = math.nan
     spectral_smoothness: float = math.nan
+    largest_jump: float = math.nan
 
     @property
     def decision_rate_hz(self) -> float:
@@ -160,11 +174,7 @@ class _ActionRecorder:
         for i, (action, done, info) in enumerate(zip(actions, dones, infos, strict=True)):
             if PENDING in info:
                 continue
-            if self.is_option_env:
-                option = info.get(PLAYED, action)
-                played = self.env.env_method("plan", option, indices=i)[0][: info["option"]["n_steps"]]
-            else:
-                played = action[None]
+            played = self.env.get_attr("played", indices=i)[0] if self.is_option_env else action[None]
             self.actions[i].append(2.0 * (played - self.low) / self.range - 1.0)
             if done:
                 episode = np.concatenate(self.actions[i])
@@ -213,6 +223,7 @@ def evaluate_discounted_return(
             for episode, played in zip(ended, recorder.step(actions, dones, infos), strict=True):
                 episode.mean_absolute_jerk = mean_absolute_jerk(played, episode.seconds / len(played))
                 episode.spectral_smoothness = spectral_smoothness(played)
+                episode.largest_jump = largest_jump(played)
         episodes += ended
     return episodes[:n_eval_episodes]
 

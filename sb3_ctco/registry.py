@@ -71,6 +71,8 @@ TASKS: dict[str, Task] = {
         Task("point_mass", "sparse point mass", "sb3_ctco/point_mass-easy-v0", {"sparse": True}),
         Task("cheetah", "cheetah run", "sb3_ctco/cheetah-run-v0"),
         Task("ball_in_cup", "ball in cup", "sb3_ctco/ball_in_cup-catch-v0"),
+        Task("visual_reacher_easy", "visual reaching, easy", "sb3_ctco/visual_reacher-easy-v0", episode_seconds=8.0),
+        Task("visual_reacher_hard", "visual reaching, hard", "sb3_ctco/visual_reacher-hard-v0", episode_seconds=8.0),
     )
 }
 
@@ -148,7 +150,7 @@ def _of_options(algorithm: type[OptionOffPolicyAlgorithm]) -> dict[str, Any]:
     """What rows of algorithms that decide by options share."""
     return {
         "constructors": (algorithm,),
-        "make": lambda make_env, dt, arguments: algorithm("MlpPolicy", make_env(), **arguments),
+        "make": lambda make_env, dt, arguments: algorithm(env=make_env(), **{"policy": "MlpPolicy", **arguments}),
         "make_eval_env": lambda model, make_env, dt, discount_rate: DummyVecEnv([lambda: model.wrap_env(make_env())]),
         "in_steps": _warm_up_in_steps,
         "zoo_class": algorithm,

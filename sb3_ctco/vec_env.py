@@ -10,10 +10,10 @@ from stable_baselines3.common.vec_env import SubprocVecEnv
 from stable_baselines3.common.vec_env.base_vec_env import VecEnvIndices, VecEnvObs, VecEnvStepReturn
 from stable_baselines3.common.vec_env.subproc_vec_env import _stack_obs
 
+from sb3_ctco.options import PLAYED
+
 #: Key of the infos of environments whose option runs on
 PENDING = "pending"
-#: Key under which the info of an option that ended tells its option vector
-PLAYED = "played"
 
 
 class AsyncOptionVecEnv(SubprocVecEnv):
@@ -75,7 +75,7 @@ class AsyncOptionVecEnv(SubprocVecEnv):
         infos: list[dict[str, Any]] = [{PENDING: True} for _ in range(self.num_envs)]
         for i, (obs, reward, done, info, reset_info) in ended.items():
             self._obs[i], rewards[i], dones[i], self.reset_infos[i] = obs, reward, done, reset_info
-            infos[i] = {**info, PLAYED: self._played[i]}
+            infos[i] = {PLAYED: self._played[i], **info}
         return _stack_obs(self._obs, self.observation_space), rewards, dones, infos
 
     def _receive(self, count: int) -> None:

@@ -106,6 +106,14 @@ def test_watch(tmp_path):
 
 
 @pytest.mark.slow
+def test_visual_reacher(tmp_path, opengl):
+    output = run_example("visual_reacher.py", tmp_path, "--minutes", "0.4", "--rate", "25")
+    assert re.search(r"training: discounted return \d\.\d\d, .* in 1 episodes", output)
+    assert re.search(r"greedy: discounted return \d\.\d\d, .* in 20 episodes", output)
+    assert (tmp_path / "runs" / "visual_reacher" / "model.zip").exists()
+
+
+@pytest.mark.slow
 def test_compare_with_sac(tmp_path):
     output = run_example("compare_with_sac.py", tmp_path, "--steps", "1500", "--net-arch", "16", "--eval-episodes", "2")
     rows = {line.split("|")[1].strip(): line.split("|")[2:-1] for line in output.splitlines() if line.startswith("|")}

@@ -45,6 +45,7 @@ def plain(model):
         {"d_min": 0.1, "d_max": 0.1},
         {"n_rbf": 3, "d_max": 0.15},
         {"n_rbf": 3, "d_max": 0.15, "canonical_weights": True},
+        {"n_rbf": 3, "d_max": 0.15, "canonical_weights": True, "join": "continuous"},
         {"n_rbf": 3, "d_max": 0.3, "duration_scale": "log", "trajectory": "bezier", "canonical_weights": True},
     ],
 )

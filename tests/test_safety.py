@@ -195,14 +195,15 @@ def test_limits_hold_by_a_clock_and_not_at_a_fixed_rate():
 
 
 def peak_of_memory(function, obs):
-    """Of 80 calls, in bytes."""
-    tracemalloc.start()
-    try:
-        for _ in range(80):
+    """Of 40 calls, in bytes; the least of two times, because the interpreter has its own needs now and then."""
+    peaks = []
+    for _ in range(2):
+        tracemalloc.start()
+        for _ in range(40):
             function(obs)
-        return tracemalloc.get_traced_memory()[1]
-    finally:
+        peaks.append(tracemalloc.get_traced_memory()[1])
         tracemalloc.stop()
+    return min(peaks)
 
 
 @pytest.mark.parametrize("n", [None, 3])
@@ -212,14 +213,20 @@ def test_between_decisions_nothing_is_allocated_and_an_action_may_be_kept(n):
     obs = np.zeros(3) if n is None else np.zeros((n, 3))
     kept = [controller(obs) for _ in range(10)]
     copies = [action.copy() for action in kept]
-    # An array, even a view of one, takes more than 100 bytes.
-    assert peak_of_memory(controller, obs) < peak_of_memory(lambda obs: None, obs) + 100
-    assert peak_of_memory(np.copy, obs) > peak_of_memory(lambda obs: None, obs) + 100
+    # An array, even a view of one, takes 48 bytes at least.
+    nothing = peak_of_memory(lambda obs: None, obs)
+    assert peak_of_memory(controller, obs) < nothing + 48 <= peak_of_memory(lambda obs: obs[:1], obs)
     assert len(policy.asked) == 1
     policy.value = -1.0
     for _ in range(150):
         controller(obs)
     np.testing.assert_array_equal(kept, copies)
+
+
+def test_smooth_commands_pass_as_they_are():
+    """At 50 Hz, up to 8 widths a second: what can be stopped within a period."""
+    targets = np.stack([np.sin(np.arange(50) * 0.1), 2 + 2 * np.cos(np.arange(50) * 0.1)], axis=1).astype(np.float32)
+    np.testing.assert_allclose(commands(Safety(), targets), targets, atol=1e-6)
 
 
 class Clock:

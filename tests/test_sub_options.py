@@ -22,7 +22,7 @@ from stable_baselines3.common.vec_env import (
 )
 
 from sb3_ctco import CTCO, DictOptionReplayBuffer, OptionExecutionWrapper, OptionReplayBuffer
-from sb3_ctco.options import discount, integrated_reward, step_weight
+from sb3_ctco.options import discount, draw_stretches, integrated_reward, step_weight
 
 TAU = math.log(2.0)
 
@@ -450,3 +450,16 @@ def test_the_residual_is_logged(random_walk_env):
     model._custom_logger = True
     model.learn(200)
     assert 0 <= values["option/slice_residual"] <= 0.1
+
+
+def test_an_option_has_fewer_sub_options_than_steps():
+    """So that long options do not fill the buffer when options become short."""
+    rng = np.random.default_rng(0)
+    for n_steps in range(1, 12):
+        counts = []
+        for _ in range(200):
+            drawn = draw_stretches(rng, 8, n_steps, shortest=1)
+            assert len(set(drawn)) == len(drawn)
+            assert all(0 <= first < end <= n_steps and (first, end) != (0, n_steps) for first, end in drawn)
+            counts.append(len(drawn))
+        assert max(counts) == min(8, n_steps - 1)

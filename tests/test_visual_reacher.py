@@ -1,19 +1,28 @@
 """The arm's kinematics, the reward, resets, pictures, and how hard the task is to explore."""
 
+import dataclasses
+import json
 import os
 import subprocess
 import sys
 import time
+from pathlib import Path
 
 import gymnasium as gym
 import numpy as np
 import pytest
 from gymnasium.error import ResetNeeded
 from gymnasium.utils.env_checker import check_env
+from stable_baselines3 import SAC
 
+from sb3_ctco import CTCO
 from sb3_ctco.envs.visual_reacher import VisualReacherEnv, servo_action
 from sb3_ctco.envs.visual_reacher.env import BAG_AREA, JOINT_MARGIN, START_POSE, WORKSPACE, bag_visibility
 from sb3_ctco.envs.visual_reacher.model import JOINT_LIMITS
+from sb3_ctco.study.agents import constructor_arguments
+from sb3_ctco.study.grid import load_preset
+from sb3_ctco.study.runs import Outcome, perform, plan
+from sb3_ctco.torch_layers import SpatialSoftmaxExtractor
 from sb3_ctco.wrappers import OptionExecutionWrapper, SupportsStepSequence, find_dt
 
 pytestmark = pytest.mark.usefixtures("opengl")
@@ -369,6 +378,9 @@ def hidden(self, name, *args, **kwargs):
         raise OSError(name)
     load(self, name, *args, **kwargs)
 ctypes.CDLL.__init__ = hidden
+from stable_baselines3 import SAC
+
+from sb3_ctco import CTCO
 from sb3_ctco.envs.visual_reacher import VisualReacherEnv
 try:
     VisualReacherEnv()
@@ -385,6 +397,9 @@ except RuntimeError as error:
 
 def test_pictures_without_a_display_need_no_setting_and_leave_quietly():
     code = """
+from stable_baselines3 import SAC
+
+from sb3_ctco import CTCO
 from sb3_ctco.envs.visual_reacher import VisualReacherEnv
 env = VisualReacherEnv()
 print(env.reset(seed=0)[0]["image"].max() > 0)
@@ -455,3 +470,26 @@ def test_speed():
     env.close()
     # Time of the processor, over all threads: other programs on the machine do not count.
     assert max(rates) >= 2500
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("setting", ["sub-options", "plain", "same"])
+def test_the_experiment_is_a_study(tmp_path, setting):
+    preset = load_preset(str(Path(__file__).parents[1] / "benchmarks" / "visual_reacher.yml"))
+    (run,) = preset.select(tasks=["visual_reacher_hard"], settings=[setting], seeds=[3])
+    shorter = {"learning_starts_seconds": 8, "buffer_size": 1000}
+    run = dataclasses.replace(run, task_seconds=16.0, eval_episodes=1, arguments={**run.arguments, **shorter})
+    plan([run], tmp_path)
+    assert perform(run, tmp_path) == Outcome(run.name, "done")
+    record = json.loads((tmp_path / run.name / "record.json").read_text())
+    assert 28 <= record["updates"] <= 36  # four a second, after the warm-up
+    model = {"ctco": CTCO, "sac": SAC}[run.algorithm].load(tmp_path / run.name / "model.zip", device="cpu")
+    assert type(model.policy.actor.features_extractor) is SpatialSoftmaxExtractor
+
+
+def test_an_encoder_that_is_not_there_is_named():
+    preset = load_preset(str(Path(__file__).parents[1] / "benchmarks" / "visual_reacher.yml"))
+    run = preset.runs[0]
+    run.arguments["policy_kwargs"]["features_extractor_class"] = "sb3_ctco.torch_layers.Softmax"
+    with pytest.raises(ValueError, match=r"no features_extractor_class sb3_ctco\.torch_layers\.Softmax; give its full name"):
+        constructor_arguments(run)

@@ -16,9 +16,11 @@ from gymnasium.utils import RecordConstructorArgs
 from sb3_ctco.option_array import plain
 from sb3_ctco.options import (
     DEFAULT_DISCOUNT_RATE,
+    LAST_ACTION,
     REWARD_UNITS,
     ActionBox,
     DurationScale,
+    Join,
     OptionInfo,
     OptionSpace,
     RewardUnit,
@@ -29,6 +31,8 @@ from sb3_ctco.options import (
     shortest_steps,
     stack,
     sub_options,
+    with_last_action,
+    with_last_action_space,
 )
 from sb3_ctco.wrappers.checks import check_observation, is_finite, reset_env
 from sb3_ctco.wrappers.step_sequence import SequenceResult, StepSequence, find_step_sequence
@@ -79,6 +83,9 @@ class OptionExecutionWrapper(gym.Wrapper, RecordConstructorArgs):
         actions count as normalised to [−1, 1]
     :param trajectory: how ω becomes actions, a name in ``sb3_ctco.options.TRAJECTORIES`` or a class
     :param duration_scale: ``"log"`` or ``"linear"``, see :class:`~sb3_ctco.options.OptionSpace`
+    :param join: ``"free"``, or ``"continuous"``: an option leaves from the action that is being sent when it begins. That
+        action, normalised, is then part of the observation (:mod:`sb3_ctco.options.joins`); an episode begins with the middle
+        of the box, or with ``info["last_action"]`` of the environment's ``reset``, in its own units
     :raises TypeError: if the action space is not a ``Box``
     :raises ValueError: if its bounds are not finite, a setting is out of range, or dt is not given and not found
     """
@@ -99,6 +106,7 @@ class OptionExecutionWrapper(gym.Wrapper, RecordConstructorArgs):
         sub_option_tolerance: float = 0.1,
         trajectory: str | type[Trajectory] = "rbf",
         duration_scale: DurationScale = "linear",
+        join: Join = "free",
     ):
         RecordConstructorArgs.__init__(
             self,
@@ -113,6 +121,7 @@ class OptionExecutionWrapper(gym.Wrapper, RecordConstructorArgs):
             sub_option_tolerance=sub_option_tolerance,
             trajectory=trajectory,
             duration_scale=duration_scale,
+            join=join,
         )
         gym.Wrapper.__init__(self, env)
 
@@ -135,7 +144,7 @@ class OptionExecutionWrapper(gym.Wrapper, RecordConstructorArgs):
         dt = find_dt(env, required_by="OptionExecutionWrapper") if dt is None else dt
         #: The settings that a policy for this environment must share.
         self.option_space = OptionSpace.make(
-            n_rbf, d_max, dt if d_min is None else d_min, dt, discount_rate, trajectory, duration_scale
+            n_rbf, d_max, dt if d_min is None else d_min, dt, discount_rate, trajectory, duration_scale, join
         )
         self.reward: Literal["sum", "integral"] = reward
         self.reward_unit: RewardUnit = reward_unit
@@ -145,6 +154,12 @@ class OptionExecutionWrapper(gym.Wrapper, RecordConstructorArgs):
         self._box = ActionBox(space.low, space.high)
         option_dim = space.low.size * n_rbf + 1
         self.action_space = spaces.Box(-1.0, 1.0, (option_dim,), np.float32)
+        if self.option_space.joined:
+            self.observation_space = with_last_action_space(env.observation_space, space.low.size)
+        #: The actions of the last option that ran, in the inner environment's units, ``[n_ran, *action_shape]``
+        self.played = np.empty((0, *space.shape), space.dtype)
+        #: What an option leaves from, normalised; None with a free join
+        self._last_action: np.ndarray | None = None
         self._play: StepSequence | None = None
 
         self.n_sub_options = 0
@@ -164,9 +179,15 @@ class OptionExecutionWrapper(gym.Wrapper, RecordConstructorArgs):
         result = reset_env(self.env, seed, options)
         if seed is not None:
             self._stretch_rng = np.random.default_rng(seed)
-        self._last_obs = deepcopy(result[0]) if self.n_sub_options else None
+        self._last_obs = deepcopy(result[0]) if self.n_sub_options else result[0]
         self._play = self._choose_play()
-        return result
+        if not self.option_space.joined:
+            return result
+        obs, info = result
+        self._last_action = np.zeros(self._box.low.size)
+        if LAST_ACTION in info:
+            self._last_action = self._box.normalise([info[LAST_ACTION]])[0].clip(-1.0, 1.0)
+        return with_last_action(self.observation_space, obs, self._last_action), info
 
     def _choose_play(self) -> StepSequence:
         """What plays an option's actions until the episode ends."""
@@ -201,7 +222,8 @@ class OptionExecutionWrapper(gym.Wrapper, RecordConstructorArgs):
         play, self._play = self._play, None
 
         space = self.option_space
-        trajectory = space.plan(option.clip(-1.0, 1.0))
+        before = self._last_action
+        trajectory = space.plan(option.clip(-1.0, 1.0), before)
         n_steps = len(trajectory)
         stretches = draw_stretches(self._stretch_rng, self.n_sub_options, n_steps, shortest_steps(space))
         observe = sorted({k for ends in stretches for k in ends} - {0, n_steps})
@@ -216,6 +238,10 @@ class OptionExecutionWrapper(gym.Wrapper, RecordConstructorArgs):
             self._play = play
 
         n_ran = len(rewards)
+        last_action = self._keep_played(actions[:n_ran])
+        if before is not None:
+            self._last_action = self._box.normalise([last_action])[0]
+            obs = with_last_action(self.observation_space, obs, self._last_action)
         integral = integrated_reward(rewards, space.dt, space.discount_rate, self.reward_unit)
         info["option"] = OptionInfo(
             duration=n_ran * space.dt,
@@ -225,9 +251,12 @@ class OptionExecutionWrapper(gym.Wrapper, RecordConstructorArgs):
         )
         if seen is not None:
             steps = [0, *observe[: len(observations)], n_ran]
-            played, ended = (trajectory, rewards, stretches, steps, seen), (terminated, truncated)
-            info["sub_options"] = sub_options(space, *played, *ended, self.reward_unit, self.sub_option_tolerance)
             self._last_obs = rows_of(seen, -1)
+            if before is not None:
+                last_actions = np.vstack([before, self._box.normalise(actions[np.minimum(steps[1:], n_steps) - 1])])
+                seen = with_last_action(self.observation_space, seen, last_actions)
+            played, ended = (trajectory, rewards, stretches, steps, seen), (terminated, truncated)
+            info["sub_options"] = sub_options(space, *played, *ended, self.reward_unit, self.sub_option_tolerance, before)
         return obs, float(rewards.sum()) if self.reward == "sum" else integral, terminated, truncated, info
 
     def set_n_sub_options(self, n_sub_options: int) -> None:
@@ -241,13 +270,18 @@ class OptionExecutionWrapper(gym.Wrapper, RecordConstructorArgs):
             self.n_sub_options = n_sub_options
             self._play = None
 
+    def _keep_played(self, actions: np.ndarray) -> np.ndarray:
+        """Keep the actions that were played, and tell the one that the next option leaves from."""
+        self.played = actions
+        return actions[-1]
+
     def plan(self, option: npt.ArrayLike) -> np.ndarray:
-        """All primitive actions of an option, in the inner environment's units.
+        """All primitive actions of an option that begins now, in the inner environment's units.
 
         :param option: shape ``[action_dim · n_rbf + 1]``
         :return: shape ``[n_steps, *action_shape]``
         """
-        return self._box.actions(self.option_space.plan(np.clip(plain(option), -1.0, 1.0)))
+        return self._box.actions(self.option_space.plan(np.clip(plain(option), -1.0, 1.0), self._last_action))
 
     def _checked(
         self, play: StepSequence, actions: np.ndarray, observe: Sequence[int]

@@ -13,9 +13,11 @@ from gymnasium.utils import RecordConstructorArgs
 from stable_baselines3.common.env_util import unwrap_wrapper
 
 from sb3_ctco.option_array import plain
+from sb3_ctco.options import PLAYED, ValueInterrupt, shortest_steps, stack, with_last_action
 from sb3_ctco.wrappers.option_execution import ON_THE_WAY, OptionExecutionWrapper
 from sb3_ctco.wrappers.real_time import RealTimeWrapper
 from sb3_ctco.wrappers.step_sequence import SequenceResult, StepSequence
+from sb3_ctco.wrappers.take_over import SENT_ACTION
 
 #: ``interrupt(observation of the last decision, observation, seconds since that one)``: whether to end the option
 Interrupt = Callable[[Any, Any, float], bool]
@@ -30,28 +32,34 @@ class RealTimeOptionWrapper(OptionExecutionWrapper):
     option before, then the new one without its rest. Its duration and rewards are exactly those of that time, so
     nothing is counted twice or late; but the state at a decision does not tell which rest is still to play. The policy
     sees the state of ``decide_ahead`` seconds before its option begins, and the process is a semi-Markov process only
-    as far as that does not matter. The first option of an episode begins at once.
+    as far as that does not matter. The first option of an episode begins at once. With a continuous join an option leaves from
+    the end of that rest, and the observation holds the action there.
 
-    With ``interrupt``, a function that is called after each primitive step, an option ends as soon as it says so; the
-    transition has the time that ran. ``info["interrupted"]`` of the environment inside ends it as well.
+    With ``interrupt``, a function that is called after each primitive step, an option ends as soon as it says so; or as soon
+    as a :class:`~sb3_ctco.options.ValueInterrupt` does, which is asked every ``check_period`` and told the rest of the plan.
+    The transition has the time that ran, and ``info["played"]`` is the option that plays what was played, as which CTCO stores
+    it (not with ``decide_ahead``, where a transition consists of parts of two options). ``info["interrupted"]`` of the
+    environment inside ends an option as well.
 
     An option that is not finite, of a policy that has diverged, is no error where commands are guarded
     (:class:`~sb3_ctco.wrappers.RealTimeWrapper`): the safe action is sent, and the next decision follows.
 
     :param env: the environment to wrap
     :param decide_ahead: in s; rounded to whole steps
-    :param interrupt: called as ``interrupt(observation of the last decision, observation, seconds since that one)``
+    :param interrupt: called as ``interrupt(observation of the last decision, observation, seconds since that one)``; or a
+        :class:`~sb3_ctco.options.ValueInterrupt`
     :param background: whether the rest of an option plays in a thread of its own, which is for environments that the
         wall clock governs and that may be stepped from another thread (one that renders may not)
     :param kwargs: see :class:`OptionExecutionWrapper`
-    :raises ValueError: if ``decide_ahead`` is negative or not shorter than the longest option
+    :raises ValueError: if ``decide_ahead`` is negative or not shorter than the longest option, or for a ValueInterrupt with
+        ``decide_ahead``
     """
 
     def __init__(
         self,
         env: gym.Env,
         decide_ahead: float = 0.0,
-        interrupt: Interrupt | None = None,
+        interrupt: Interrupt | ValueInterrupt | None = None,
         background: bool = False,
         **kwargs: Any,
     ):
@@ -63,28 +71,44 @@ class RealTimeOptionWrapper(OptionExecutionWrapper):
             raise ValueError(
                 f"decide_ahead must be at least 0 s and less than d_max={self.option_space.d_max} s, not {decide_ahead}"
             )
-        self.interrupt = interrupt
         self._ahead_steps = round(decide_ahead / self.option_space.dt)
         self._executor = ThreadPoolExecutor(1, thread_name_prefix="option") if background else None
         self._rest: np.ndarray | None = None
+        self._commands: list[np.ndarray] = []
         self._playing_rest: Future[SequenceResult] | None = None
         self._abandoned = False
         self._decided_on: Any = None
         self._play: StepSequence | None = None
+        self.interrupt = interrupt
         real_time = unwrap_wrapper(env, RealTimeWrapper)
         self._is_guarded = isinstance(real_time, RealTimeWrapper) and real_time.guard is not None
         self._is_lost = False
 
-    def step(self, action: npt.ArrayLike) -> tuple[Any, SupportsFloat, bool, bool, dict[str, Any]]:
-        """Play one option; see :meth:`OptionExecutionWrapper.step`."""
-        option = np.asarray(plain(action), dtype=np.float64)
-        self._is_lost = self._is_guarded and not np.isfinite(option).all()
-        # In its place the shortest one, whose actions the guard replaces.
-        return super().step(np.full_like(option, -1.0) if self._is_lost else option)
+    @property
+    def interrupt(self) -> Interrupt | ValueInterrupt | None:
+        """What ends an option early; may be set between two steps."""
+        return self._interrupt
+
+    @interrupt.setter
+    def interrupt(self, interrupt: Interrupt | ValueInterrupt | None) -> None:
+        self._interrupt = interrupt
+        #: What a ValueInterrupt's period is in steps
+        self._check_steps: int | None = None
+        if isinstance(interrupt, ValueInterrupt):
+            if self._ahead_steps:
+                raise ValueError(
+                    "a ValueInterrupt compares the rest of an option with the next one, which is decided on already with "
+                    "decide_ahead: pass decide_ahead=0, or a rule about observations"
+                )
+            self._check_steps = max(1, round(interrupt.check_period / self.option_space.dt))
 
     @classmethod
     def like(
-        cls, wrapper: OptionExecutionWrapper, decide_ahead: float, interrupt: Interrupt | None, background: bool
+        cls,
+        wrapper: OptionExecutionWrapper,
+        decide_ahead: float,
+        interrupt: Interrupt | ValueInterrupt | None,
+        background: bool,
     ) -> "RealTimeOptionWrapper":
         """The same wrapper around the same environment, with what this class adds."""
         return cls(
@@ -103,9 +127,25 @@ class RealTimeOptionWrapper(OptionExecutionWrapper):
         """Reset the inner environment."""
         self.abandon()
         self._abandoned = False
-        obs, info = super().reset(seed=seed, options=options)
-        self._decided_on = obs
-        return obs, info
+        result = super().reset(seed=seed, options=options)
+        self._commands = []
+        self._decided_on = self._last_obs
+        return result
+
+    def step(self, action: npt.ArrayLike) -> tuple[Any, SupportsFloat, bool, bool, dict[str, Any]]:
+        """Play one option, or what is due of it and of the one before."""
+        before = self._last_action
+        option = np.asarray(plain(action), dtype=np.float64)
+        self._is_lost = self._is_guarded and not np.isfinite(option).all()
+        # In the place of a lost one the shortest, whose actions the guard replaces.
+        result = super().step(np.full_like(option, -1.0) if self._is_lost else option)
+        info = result[4]
+        if info.get("interrupted", False) and not self._ahead_steps:
+            played = self._box.normalise(self.played)
+            option, residual = self.option_space.stretch(played, 0, len(played), before)
+            if residual <= self.sub_option_tolerance:
+                info[PLAYED] = option
+        return result
 
     def _choose_play(self) -> StepSequence:
         return self._play_around_decisions
@@ -126,6 +166,10 @@ class RealTimeOptionWrapper(OptionExecutionWrapper):
             self._executor.shutdown()
         super().close()
 
+    def _keep_played(self, actions: np.ndarray) -> np.ndarray:
+        last = super()._keep_played(self._played)
+        return last if self._rest is None else self._rest[-1]
+
     def _play_around_decisions(self, plan: np.ndarray, observe: Sequence[int] = ()) -> SequenceResult:
         rest = self._finish_rest()
         if self._is_lost:
@@ -145,7 +189,9 @@ class RealTimeOptionWrapper(OptionExecutionWrapper):
         # A sub-option that was decided on after k steps of this time would play as this option does from its step k on.
         on_the_way = result[4].pop(ON_THE_WAY)
         if observe:
-            result[4][ON_THE_WAY] = [on_the_way[k - 1] for k in observe if k < len(result[1])]
+            n_ran = len(result[1])  # type: ignore[arg-type]
+            result[4][ON_THE_WAY] = [on_the_way[k - 1] for k in observe if k < n_ran]
+        self._played, self._commands = np.array(self._commands), []
         if not over and n_now < len(plan):
             self._rest = plan[n_now:]
             if self._executor is not None:
@@ -166,15 +212,27 @@ class RealTimeOptionWrapper(OptionExecutionWrapper):
             if self._abandoned:
                 raise ResetNeeded("playing was abandoned: call reset() first")
             obs, reward, terminated, truncated, info = self.env.step(action)
+            self._commands.append(info.get(SENT_ACTION, action))
             rewards.append(reward)
             if self.n_sub_options:
                 # All of them, because those of a rest are chosen after it.
                 observations.append(deepcopy(obs))
-            if terminated or truncated or info.get("interrupted"):
+            if terminated or truncated or info.get("interrupted", False):
                 break
-            if self.interrupt is not None and self.interrupt(
-                self._decided_on, obs, (steps_before + len(rewards)) * self.option_space.dt
-            ):
+            if self._interrupt is not None and self._is_interrupted(obs, actions, len(rewards), steps_before):
                 info = {**info, "interrupted": True}
                 break
         return obs, rewards, terminated, truncated, {**info, ON_THE_WAY: observations}
+
+    def _is_interrupted(self, obs: Any, actions: np.ndarray, n_ran: int, steps_before: int) -> bool:
+        if self._check_steps is None:
+            assert callable(self._interrupt)
+            return self._interrupt(self._decided_on, obs, (steps_before + n_ran) * self.option_space.dt)
+        if n_ran % self._check_steps or len(actions) - n_ran < shortest_steps(self.option_space):
+            return False
+        assert isinstance(self._interrupt, ValueInterrupt)
+        plan = self._box.normalise(actions)
+        rest, _ = self.option_space.stretch(plan, n_ran, len(plan), self._last_action)
+        if self.option_space.joined:
+            obs = with_last_action(self.observation_space, obs, plan[n_ran - 1])
+        return bool(self._interrupt.worth_ending(stack([obs]), rest[None])[0])

@@ -17,6 +17,8 @@ from sb3_ctco.wrappers.timing import find_dt
 TakeOver = Callable[[Any], Any]
 #: Key of the infos of steps in which another action was sent than the policy's
 TAKEN_OVER = "taken_over"
+#: Key under which an info tells the action that was sent, where that is not the one that was given
+SENT_ACTION = "sent_action"
 
 
 class TakeOverWrapper(gym.Wrapper, RecordConstructorArgs):
@@ -61,9 +63,10 @@ class TakeOverWrapper(gym.Wrapper, RecordConstructorArgs):
         if other is not None:
             self._observations = self._observations or [self._last_obs]
             self._observations.append(deepcopy(obs))
-            self._actions.append(other)
+            # A guard inside may have sent another one.
+            self._actions.append(info.get(SENT_ACTION, other))
             self._rewards.append(float(reward))
-            info = {**info, TAKEN_OVER: True}
+            info = {SENT_ACTION: other, **info, TAKEN_OVER: True}
         self._ask(obs)
         if self._next_action is None or terminated or truncated:
             self.hand_over(terminated, truncated)

@@ -23,6 +23,8 @@ from sb3_ctco.options import (
     rows_of,
     shortest_steps,
     sub_options,
+    with_last_action,
+    without_last_action_space,
 )
 from sb3_ctco.vec_env import PENDING
 
@@ -180,7 +182,9 @@ class _OptionStorage(ReplayBuffer):
         ``demonstration_fraction`` of each batch is drawn from them. Nothing is stored if anything is wrong.
 
         Options are in seconds, so the trajectory may have been recorded at another rate than the environment's. A stretch
-        is of whole recorded steps: where these are longer than d_min, no option is shorter than one of them.
+        is of whole recorded steps: where these are longer than d_min, no option is shorter than one of them. With a continuous
+        join observations are the environment's, without the last action, and the first step only tells what the others leave
+        from.
 
         :param observations: ``[n + 1, *observation_shape]``, in the end the one after the last action; or a dictionary of such
         :param actions: in the units of the environment, ``[n, *action_shape]``
@@ -216,8 +220,17 @@ class _OptionStorage(ReplayBuffer):
             )
         rewards = np.asarray(rewards, dtype=np.float64)
         plan = ActionBox(self.primitive_action_space.low, self.primitive_action_space.high).normalise(actions)
-        seen = _recorded(observations, self.observation_space)
+        observation_space = self.observation_space
+        if space.joined:
+            observation_space = without_last_action_space(observation_space, plan.shape[1])
+        seen = _recorded(observations, observation_space)
         _check_recorded(seen, plan, rewards)
+        before = None
+        if space.joined:
+            # Nobody knows the action before the first one, so that options begin with the second.
+            before = plan
+            plan, rewards, seen = plan[1:], rewards[1:], rows_of(seen, slice(1, None))
+            seen = with_last_action(self.observation_space, seen, before)
 
         n_steps = len(rewards)
         firsts = np.arange(n_steps).repeat(n_stretches)
@@ -232,7 +245,8 @@ class _OptionStorage(ReplayBuffer):
             window, rows = slice(first, end), slice(first, end + 1)
             played = (plan[window], rewards[window], stretches, list(range(end - first + 1)), rows_of(seen, rows))
             ended = (terminated and end == n_steps, truncated and end == n_steps)
-            parts.append(sub_options(space, *played, *ended, reward_unit, tolerance))
+            leaves_from = None if before is None else before[first]
+            parts.append(sub_options(space, *played, *ended, reward_unit, tolerance, leaves_from))
         added = sum(map(len, parts))
         if self.n_demonstrations + added >= self.buffer_size:
             raise ValueError(
@@ -244,7 +258,7 @@ class _OptionStorage(ReplayBuffer):
             row = self.buffer_size - self.n_demonstrations
             self._write(slice(row, row + len(part)), part)
         self._move_to(self.pos)
-        residuals = np.concatenate([part.residuals for part in parts])
+        residuals = np.concatenate([np.empty(0), *(part.residuals for part in parts)])
         return AddedTrajectory(added, len(firsts) - added, float(residuals.max(initial=0.0)))
 
     def size(self) -> int:

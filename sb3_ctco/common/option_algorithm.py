@@ -44,7 +44,7 @@ from sb3_ctco.common.buffers import DictOptionReplayBuffer, OptionReplayBuffer
 from sb3_ctco.common.callbacks import OptionProgressBarCallback, PrimitiveStepCallback, eval_callbacks
 from sb3_ctco.common.load_arguments import check_load_arguments
 from sb3_ctco.option_array import OptionArray
-from sb3_ctco.options import DurationScale, OptionSpace, Trajectory, discount_rate_from_gamma
+from sb3_ctco.options import DurationScale, Join, OptionSpace, Trajectory, discount_rate_from_gamma
 from sb3_ctco.vec_env import PLAYED, AsyncOptionVecEnv
 from sb3_ctco.wrappers import OptionExecutionWrapper, find_dt
 
@@ -67,6 +67,7 @@ class OptionOffPolicyAlgorithm(OffPolicyAlgorithm):
     :param dt: the environment's interaction period, in s; by default found in the environment
     :param trajectory: how ω becomes actions, a name in ``sb3_ctco.options.TRAJECTORIES`` or a class
     :param duration_scale: ``"log"`` or ``"linear"``, see :class:`~sb3_ctco.options.OptionSpace`
+    :param join: ``"free"`` or ``"continuous"``, see :class:`~sb3_ctco.wrappers.OptionExecutionWrapper`
     :param reward_scale: what R is multiplied by for the critics, or ``"auto"``, see
         :class:`~sb3_ctco.common.buffers.OptionReplayBuffer`
     :param gamma: discount factor over ``gamma_dt`` seconds, in (0, 1]
@@ -87,6 +88,7 @@ class OptionOffPolicyAlgorithm(OffPolicyAlgorithm):
         "d_min",
         "trajectory",
         "duration_scale",
+        "join",
         "reward_scale",
         "canonical_weights",
         "n_repetitions",
@@ -98,7 +100,7 @@ class OptionOffPolicyAlgorithm(OffPolicyAlgorithm):
     _own_setting: ClassVar[str] = "discount_rate"
 
     #: Of arguments that older files do not have: what their networks were trained with
-    _before_it_was_saved: ClassVar[dict[str, Any]] = {"duration_scale": "linear", "reward_scale": 1.0}
+    _before_it_was_saved: ClassVar[dict[str, Any]] = {"duration_scale": "linear", "join": "free", "reward_scale": 1.0}
 
     def __init__(
         self,
@@ -112,6 +114,7 @@ class OptionOffPolicyAlgorithm(OffPolicyAlgorithm):
         dt: float | None,
         trajectory: str | type[Trajectory] = "rbf",
         duration_scale: DurationScale = "linear",
+        join: Join = "free",
         reward_scale: float | Literal["auto"] = 1.0,
         gamma: float,
         gamma_dt: float,
@@ -127,6 +130,7 @@ class OptionOffPolicyAlgorithm(OffPolicyAlgorithm):
         self.dt = dt
         self.trajectory = trajectory
         self.duration_scale: DurationScale = duration_scale
+        self.join: Join = join
         self.reward_scale: float | Literal["auto"] = reward_scale
         self.gamma = gamma
         self.gamma_dt = gamma_dt
@@ -183,7 +187,7 @@ class OptionOffPolicyAlgorithm(OffPolicyAlgorithm):
     @property
     def _option_arguments(self) -> dict[str, Any]:
         """OptionExecutionWrapper's arguments for the same options, ``dt`` and ``d_min`` as far as they are known."""
-        names = ("n_rbf", "d_max", "d_min", "dt", "trajectory", "duration_scale", "discount_rate")
+        names = ("n_rbf", "d_max", "d_min", "dt", "trajectory", "duration_scale", "join", "discount_rate")
         return {name: getattr(self, name) for name in names}
 
     @classmethod
@@ -192,7 +196,7 @@ class OptionOffPolicyAlgorithm(OffPolicyAlgorithm):
 
         :param arguments: the algorithm's arguments, defaults included
         """
-        names = ("n_rbf", "d_max", "d_min", "dt", "trajectory", "duration_scale", "n_sub_options")
+        names = ("n_rbf", "d_max", "d_min", "dt", "trajectory", "duration_scale", "join", "n_sub_options")
         kwargs = {name: arguments[name] for name in names if name in arguments}
         return {**kwargs, "discount_rate": discount_rate_from_gamma(arguments["gamma"], arguments["gamma_dt"])}
 

@@ -18,7 +18,7 @@ class CanonicalOptions:
 
     def __init__(self, space: OptionSpace, device: th.device | str):
         self._space = space
-        self._matrices = th.as_tensor(space.trajectory.canonical(), dtype=th.float32, device=device)
+        self._matrices = th.as_tensor(space.trajectory.canonical(space.joined), dtype=th.float32, device=device)
 
     @staticmethod
     def makes_no_difference(space: OptionSpace) -> bool:

@@ -19,7 +19,7 @@ from sb3_ctco.common.soft_actor_critic import SoftOptionActorCritic
 from sb3_ctco.ctco.canonical import CanonicalOptions
 from sb3_ctco.ctco.fast_update import FastUpdate
 from sb3_ctco.ctco.policies import CnnPolicy, CTCOPolicy, MlpPolicy, MultiInputPolicy, OptionActor, OptionCritic
-from sb3_ctco.options import DurationScale, Trajectory
+from sb3_ctco.options import DurationScale, Join, Trajectory
 
 SelfCTCO = TypeVar("SelfCTCO", bound="CTCO")
 
@@ -70,6 +70,8 @@ class CTCO(SoftOptionActorCritic):
     :param trajectory: how ω becomes actions: ``"rbf"``, the paper's radial basis functions, ``"bezier"``, or a subclass of
         :class:`~sb3_ctco.options.Trajectory`
     :param duration_scale: ``"linear"``, the paper's, or ``"log"``, see :class:`~sb3_ctco.options.OptionSpace`
+    :param join: where an option's actions begin: wherever its weights say (``"free"``, the paper's way), or at the action that
+        is being sent then (``"continuous"``), see :class:`~sb3_ctco.wrappers.OptionExecutionWrapper`
     :param reward_scale: what R is multiplied by for the critics, a number, or ``"auto"`` for a unit that does not depend on
         that of rewards, in which the best option before learning, if it were repeated forever, is worth 100. β_h and
         temperatures are in the unit of what results
@@ -138,6 +140,7 @@ class CTCO(SoftOptionActorCritic):
         dt: float | None = None,
         trajectory: str | type[Trajectory] = "rbf",
         duration_scale: DurationScale = "linear",
+        join: Join = "free",
         reward_scale: float | Literal["auto"] = 1.0,
         high_freq_penalty: float | Schedule = 0.003,
         target_decision_rate: float | None = None,
@@ -187,6 +190,7 @@ class CTCO(SoftOptionActorCritic):
             dt=dt,
             trajectory=trajectory,
             duration_scale=duration_scale,
+            join=join,
             reward_scale=reward_scale,
             gamma=gamma,
             gamma_dt=gamma_dt,
@@ -252,6 +256,7 @@ class CTCO(SoftOptionActorCritic):
             "reward_scale": 1.0,
             "trajectory": "rbf",
             "duration_scale": "linear",
+            "join": "free",
             "entropy_reference": "paper",
             "policy_kwargs": {"n_critics": 1, "net_arch": {"pi": [10, 10], "qf": [64, 64]}},
         }

@@ -187,7 +187,8 @@ class FiGARSAC(SoftOptionActorCritic):
             )
         if d_max is None:
             d_max = (20 if n_repetitions is None else n_repetitions) * dt
-        return super().wrapper_kwargs({**arguments, "n_rbf": 1, "d_max": d_max, "d_min": None, "duration_scale": "linear"})
+        fixed = {"n_rbf": 1, "d_min": None, "duration_scale": "linear", "join": "free"}
+        return super().wrapper_kwargs({**arguments, **fixed, "d_max": d_max})
 
     def _resolve_repetitions(self, dt: float) -> None:
         """Make ``n_repetitions`` and ``d_max``, of which the user gave one, say the same at the first dt that is known."""

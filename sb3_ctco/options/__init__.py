@@ -16,8 +16,17 @@ R              ``integrated_reward``                        reward rate × s
 ============== ============================================ ========================
 """
 
+from sb3_ctco.options.interrupts import ValueInterrupt
+from sb3_ctco.options.joins import (
+    LAST_ACTION,
+    OBSERVATION,
+    with_last_action,
+    with_last_action_space,
+    without_last_action_space,
+)
 from sb3_ctco.options.semi_mdp import (
     DEFAULT_DISCOUNT_RATE,
+    PLAYED,
     REWARD_UNITS,
     FloatArray,
     OptionInfo,
@@ -29,19 +38,24 @@ from sb3_ctco.options.semi_mdp import (
     step_weight,
     steps_in,
 )
-from sb3_ctco.options.space import DURATION_SCALES, ActionBox, DurationScale, OptionSpace
+from sb3_ctco.options.space import DURATION_SCALES, JOINS, ActionBox, DurationScale, Join, OptionSpace
 from sb3_ctco.options.sub_options import Stacked, SubOptions, draw_stretches, rows_of, shortest_steps, stack, sub_options
 from sb3_ctco.options.trajectory import TRAJECTORIES, BezierCurve, RadialBasis, Trajectory, basis_of_steps
 
 __all__ = [
     "DEFAULT_DISCOUNT_RATE",
     "DURATION_SCALES",
+    "JOINS",
+    "LAST_ACTION",
+    "OBSERVATION",
+    "PLAYED",
     "REWARD_UNITS",
     "TRAJECTORIES",
     "ActionBox",
     "BezierCurve",
     "DurationScale",
     "FloatArray",
+    "Join",
     "OptionInfo",
     "OptionSpace",
     "RadialBasis",
@@ -49,6 +63,7 @@ __all__ = [
     "Stacked",
     "SubOptions",
     "Trajectory",
+    "ValueInterrupt",
     "basis_of_steps",
     "discount",
     "discount_rate_from_gamma",
@@ -61,4 +76,7 @@ __all__ = [
     "step_weight",
     "steps_in",
     "sub_options",
+    "with_last_action",
+    "with_last_action_space",
+    "without_last_action_space",
 ]

@@ -15,6 +15,10 @@ RewardUnit = Literal["rate", "impulse"]
 REWARD_UNITS: tuple[RewardUnit, ...] = ("rate", "impulse")
 
 
+#: Key under which the info of an option that ended tells its option vector, where that is not the action of this step
+PLAYED = "played"
+
+
 class OptionInfo(TypedDict):
     """What ran of an option: ``info["option"]``.
 

@@ -12,6 +12,8 @@ from sb3_ctco.options.trajectory import TRAJECTORIES, Trajectory
 
 DurationScale = Literal["log", "linear"]
 DURATION_SCALES: tuple[DurationScale, ...] = ("log", "linear")
+Join = Literal["free", "continuous"]
+JOINS: tuple[Join, ...] = ("free", "continuous")
 
 
 @dataclass(frozen=True)
@@ -27,6 +29,8 @@ class OptionSpace:
     :param discount_rate: τ, in 1/s
     :param duration_scale: how [−1, 1] maps to [d_min, d_max]: ``"linear"`` is the paper's, with ``"log"`` equal steps
         multiply the duration, so that short ones are as easy to tell apart as long ones whatever ``d_max`` is
+    :param join: where an option's actions begin: ``"free"``, wherever its weights say, or ``"continuous"``, at the action that
+        is being sent when it begins
     :raises ValueError: if a setting is out of its range
     """
 
@@ -36,6 +40,7 @@ class OptionSpace:
     dt: float
     discount_rate: float
     duration_scale: DurationScale = "linear"
+    join: Join = "free"
 
     def __post_init__(self) -> None:
         for name in ("dt", "d_max", "d_min"):
@@ -51,6 +56,8 @@ class OptionSpace:
             raise ValueError(f"discount_rate must be a finite number of 1/s that is at least 0, not {self.discount_rate}")
         if self.duration_scale not in DURATION_SCALES:
             raise ValueError(f"duration_scale must be one of {DURATION_SCALES}, not {self.duration_scale!r}")
+        if self.join not in JOINS:
+            raise ValueError(f"join must be one of {JOINS}, not {self.join!r}")
 
     @classmethod
     def make(
@@ -62,6 +69,7 @@ class OptionSpace:
         discount_rate: float,
         trajectory: str | type[Trajectory] = "rbf",
         duration_scale: DurationScale = "linear",
+        join: Join = "free",
     ) -> "OptionSpace":
         """An option space from the arguments that wrappers and algorithms take.
 
@@ -72,7 +80,12 @@ class OptionSpace:
             if trajectory not in TRAJECTORIES:
                 raise ValueError(f"trajectory must be one of {list(TRAJECTORIES)} or a Trajectory class, not {trajectory!r}")
             trajectory = TRAJECTORIES[trajectory]
-        return cls(trajectory(n_rbf), d_max, d_min, dt, discount_rate, duration_scale)
+        return cls(trajectory(n_rbf), d_max, d_min, dt, discount_rate, duration_scale, join)
+
+    @property
+    def joined(self) -> bool:
+        """Whether an option leaves from the action that is being sent when it begins."""
+        return self.join == "continuous"
 
     @property
     def arguments(self) -> dict[str, Any]:
@@ -131,10 +144,30 @@ class OptionSpace:
         """
         return option[:-1].reshape(-1, self.trajectory.n_weights), steps_in(self.duration(option), self.dt)
 
-    def plan(self, option: FloatArray) -> FloatArray:
-        """All actions of an option, normalised: shape ``[n_steps, action_dim]``."""
+    def stretch(self, plan: FloatArray, first: int, end: int, before: FloatArray | None = None) -> tuple[FloatArray, float]:
+        """The option that comes closest to a stretch of a plan.
+
+        :param plan: normalised actions, shape ``[n_steps, action_dim]``
+        :param first: the first step of the stretch
+        :param end: the step after its last
+        :param before: with a continuous join the action from which the plan leaves, normalised
+        :return: the option vector, float32, and the largest deviation of its actions from the plan
+        """
+        omega, residuals = self.trajectory.fit(plan, np.array([first]), np.array([end]), before)
+        return self.encode(omega, np.array([end - first]))[0], float(residuals[0])
+
+    def plan(self, option: FloatArray, before: FloatArray | None = None) -> FloatArray:
+        """All actions of an option, normalised.
+
+        :param option: shape ``[action_dim · n_weights + 1]``, entries in [−1, 1]
+        :param before: with a continuous join the action that is being sent when it begins, normalised, shape ``[action_dim]``
+        :return: shape ``[n_steps, action_dim]``
+        :raises ValueError: if ``before`` is missing with a continuous join, or given with a free one
+        """
+        if (before is not None) != self.joined:
+            raise ValueError(f"with join={self.join!r} a plan depends {'' if self.joined else 'not '}on the action before it")
         omega, n_steps = self.decode(option)
-        return self.trajectory.plan(omega, n_steps)
+        return self.trajectory.plan(omega, n_steps, before)
 
 
 class ActionBox:

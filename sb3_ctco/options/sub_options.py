@@ -36,14 +36,18 @@ def shortest_steps(space: OptionSpace) -> int:
 def draw_stretches(rng: np.random.Generator, n: int, n_steps: int, shortest: int) -> list[tuple[int, int]]:
     """Random stretches of an option of ``n_steps``, of at least ``shortest`` steps, and not all of it.
 
-    :param n: how many to draw; those that are too short or all of it are left out
+    There are fewer of them than steps. Otherwise what is played when options are still long would fill most of a replay buffer
+    if options become as short as a step.
+
+    :param n: how many to draw; those that are too short, all of it or drawn before are left out
     :return: pairs of the first step, and the step after the last
     """
     if n == 0 or n_steps <= shortest:
         return []
-    pairs = rng.integers(0, n_steps + 1, size=(n, 2))
+    pairs = rng.integers(0, n_steps + 1, size=(min(n, n_steps - 1), 2))
     pairs.sort(axis=1)
-    return [(first, end) for first, end in pairs.tolist() if shortest <= end - first < n_steps]
+    drawn = dict.fromkeys(map(tuple, pairs.tolist()))
+    return [(first, end) for first, end in drawn if shortest <= end - first < n_steps]
 
 
 @dataclass(frozen=True, eq=False)
@@ -109,6 +113,7 @@ def sub_options(
     truncated: bool,
     reward_unit: RewardUnit = "rate",
     tolerance: float = 0.1,
+    before: FloatArray | None = None,
 ) -> SubOptions:
     """Transitions of stretches of an option; at the episode's end they end with it, or are dropped.
 
@@ -122,6 +127,7 @@ def sub_options(
     :param truncated: whether it was truncated with it
     :param reward_unit: ``"rate"`` or ``"impulse"``, see :func:`~sb3_ctco.options.integrated_reward`
     :param tolerance: largest deviation that a stretch's fitted actions may have, normalised
+    :param before: with a continuous join the normalised action that was being sent when the option began, ``[action_dim]``
     """
     n_ran = len(rewards)
     firsts, ends = np.array(stretches, dtype=np.int64).reshape(-1, 2).T
@@ -129,7 +135,7 @@ def sub_options(
         ends = np.minimum(ends, n_ran)
         long_enough = ends - firsts >= shortest_steps(space)
         firsts, ends = firsts[long_enough], ends[long_enough]
-    omega, residuals = space.trajectory.fit(plan, firsts, ends)
+    omega, residuals = space.trajectory.fit(plan, firsts, ends, before)
     kept = residuals <= tolerance
     if not kept.all():
         firsts, ends, omega, residuals = firsts[kept], ends[kept], omega[kept], residuals[kept]

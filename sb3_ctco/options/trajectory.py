@@ -40,17 +40,37 @@ class Trajectory(ABC):
         :return: shape ``[n_steps, n_weights]``
         """
 
-    def plan(self, omega: FloatArray, n_steps: int) -> FloatArray:
+    def joined_basis(self, phase: FloatArray) -> FloatArray:
+        """Likewise, of an option that leaves from the action before it: what that counts, and then what the weights count.
+
+        The action before counts 1 at phase 0, and (1 − x)^n_weights at the phase x: what a Bézier curve's first point counts
+        that has the weights as its other points.
+
+        :param phase: t/d in [0, 1], shape ``[n_steps]``
+        :return: shape ``[n_steps, 1 + n_weights]``; rows are non-negative and sum to one
+        """
+        before = (1.0 - np.asarray(phase)[:, None]) ** self.n_weights
+        return np.hstack([before, (1.0 - before) * self.basis(phase)])
+
+    def plan(self, omega: FloatArray, n_steps: int, start: FloatArray | None = None) -> FloatArray:
         """The whole open-loop action trajectory a_t = φ(t/d)ᵀω of an option, equation (4) of the paper.
 
         :param omega: weights, shape ``[action_dim, n_weights]``
-        :param n_steps: number of primitive steps of the option, whose phases are k/n_steps
-        :return: one action a step, shape ``[n_steps, action_dim]``, in the box that ω is in
+        :param n_steps: number of primitive steps of the option, whose phases are k/n_steps; from a start they are
+            (k + 1)/n_steps, because the start was played already
+        :param start: the action that the plan leaves from, shape ``[action_dim]``; None for a plan that begins anywhere
+        :return: one action a step, shape ``[n_steps, action_dim]``, in the box that ω and the start are in
         """
-        return basis_of_steps(self, n_steps) @ np.asarray(omega).T
+        if start is None:
+            return basis_of_steps(self, n_steps) @ np.asarray(omega).T
+        return basis_of_steps(self, n_steps, joined=True) @ np.vstack([start, np.asarray(omega).T])
 
     def fit(
-        self, plan: FloatArray, firsts: npt.NDArray[np.integer], ends: npt.NDArray[np.integer]
+        self,
+        plan: FloatArray,
+        firsts: npt.NDArray[np.integer],
+        ends: npt.NDArray[np.integer],
+        start: FloatArray | None = None,
     ) -> tuple[FloatArray, FloatArray]:
         """The options whose actions come closest to stretches of a plan: least squares, clipped to [−1, 1].
 
@@ -59,29 +79,37 @@ class Trajectory(ABC):
         :param plan: normalised actions, shape ``[n_steps, action_dim]``
         :param firsts: the first step of each stretch, shape ``[n]``
         :param ends: the step after its last, shape ``[n]``
+        :param start: the action that the plan leaves from, shape ``[action_dim]``; each stretch then leaves from the action
+            before its first step. None for options that begin anywhere
         :return: ω, shape ``[n, action_dim, n_weights]``, and the residuals, the largest deviation of an action from the
             plan, shape ``[n]``
         """
         if not len(firsts):
             return np.empty((0, plan.shape[1], self.n_weights)), np.empty(0)
+        joined = start is not None
+        if joined:
+            # The action before a stretch is a row of it, and a weight that is known.
+            plan, ends = np.vstack([start, plan]), ends + 1
         lengths = ends - firsts
         # One row a step, the stretches one after the other: they begin at the rows `starts`.
         starts = lengths.cumsum() - lengths
         actions = np.concatenate([plan[first:end] for first, end in zip(firsts.tolist(), ends.tolist(), strict=True)])
-        tables = np.concatenate([_basis_and_fit(self, length) for length in lengths.tolist()])
+        tables = np.concatenate([_basis_and_fit(self, length - joined, joined) for length in lengths.tolist()])
         basis, fit = tables[:, 0], tables[:, 1]
         omega = np.add.reduceat(actions[:, :, None] * fit[:, None], starts).clip(-1.0, 1.0)
         fitted = np.einsum("tai,ti->ta", omega.repeat(lengths, axis=0), basis)
-        return omega, np.maximum.reduceat(np.abs(fitted - actions), starts).max(axis=1)
+        return omega[:, :, int(joined) :], np.maximum.reduceat(np.abs(fitted - actions), starts).max(axis=1)
 
-    def canonical(self) -> FloatArray:
+    def canonical(self, joined: bool = False) -> FloatArray:
         """What turns the weights of options into weights that play the same actions, the same for all that do.
 
+        :param joined: whether options leave from the action before them; the matrices do not depend on that action
         :return: shape ``[n_weights, n_weights, n_weights]``: the matrix at index k − 1 is for options of k steps (and the last
             one, the identity, for longer ones): ``matrix @ ω`` for an action dimension's weights
         """
-        matrices = [_basis_and_fit(self, k) for k in range(1, self.n_weights)]
-        return np.stack([*(table[:, 1].T @ table[:, 0] for table in matrices), np.eye(self.n_weights)])
+        rows = slice(int(joined), None)
+        tables = [_basis_and_fit(self, k, joined)[rows, :, rows] for k in range(1, self.n_weights)]
+        return np.stack([*(table[:, 1].T @ table[:, 0] for table in tables), np.eye(self.n_weights)])
 
 
 class RadialBasis(Trajectory):
@@ -110,30 +138,47 @@ class BezierCurve(Trajectory):
         binomials = np.array([math.comb(self.n_weights - 1, k) for k in i], dtype=np.float64)
         return binomials * x**i * (1.0 - x) ** (self.n_weights - 1 - i)
 
+    def joined_basis(self, phase: FloatArray) -> FloatArray:
+        """The same curve with one more control point, its first; shape ``[n_steps, 1 + n_weights]``."""
+        return BezierCurve(self.n_weights + 1).basis(phase)
+
 
 #: Trajectories that a name stands for, in hyperparameter files and in exported policies
 TRAJECTORIES: dict[str, type[Trajectory]] = {"rbf": RadialBasis, "bezier": BezierCurve}
 
 
 @lru_cache(maxsize=4096)
-def basis_of_steps(trajectory: Trajectory, n_steps: int) -> FloatArray:
+def basis_of_steps(trajectory: Trajectory, n_steps: int, joined: bool = False) -> FloatArray:
     """φ(t/d) at the steps t = 0, dt, …, (n − 1)·dt of an option of n steps: the phases k/n. Cached and read-only.
 
-    :return: shape ``[n_steps, n_weights]``
+    :param joined: whether it leaves from the action before it, which was played at phase 0: the phases are (k + 1)/n
+    :return: shape ``[n_steps, n_weights]``, or ``[n_steps, 1 + n_weights]``
     """
-    matrix = trajectory.basis(np.arange(n_steps) / n_steps)
+    steps = np.arange(n_steps)
+    matrix = trajectory.joined_basis((steps + 1) / n_steps) if joined else trajectory.basis(steps / n_steps)
     matrix.setflags(write=False)
     return matrix
 
 
 @lru_cache(maxsize=4096)
-def _basis_and_fit(trajectory: Trajectory, n_steps: int) -> FloatArray:
-    """φ, and what turns an action plan of n steps into the weights that fit it best: ``[n_steps, 2, n_weights]``."""
-    matrix = basis_of_steps(trajectory, n_steps)
-    # About the plan's mean, which equal weights give exactly: where few steps leave weights open, they stay near it.
-    mean = np.full((1, n_steps), 1.0 / n_steps)
-    inverse = np.linalg.pinv(matrix)
-    return np.stack([matrix, (mean + inverse - inverse.sum(axis=1, keepdims=True) * mean).T], axis=1)
+def _basis_and_fit(trajectory: Trajectory, n_steps: int, joined: bool = False) -> FloatArray:
+    """φ, and what turns an action plan of n steps into the weights that fit it best: ``[n_steps, 2, n_weights]``.
+
+    Where the action before counts, it has the first row, and is the first weight: ``[1 + n_steps, 2, 1 + n_weights]``.
+    """
+    matrix = basis_of_steps(trajectory, n_steps, joined)
+    before, of_weights = (matrix[:, :1], matrix[:, 1:]) if joined else (np.zeros((n_steps, 1)), matrix)
+    # About the equal weights that fit best, which give a constant exactly: where few steps leave weights open, they stay near
+    # these. What the weights count together is 1, but for what the action before counts.
+    together = 1.0 - before[:, 0]
+    mean = (together / (together @ together))[None]
+    inverse = np.linalg.pinv(of_weights)
+    fit = mean + inverse - (inverse * together).sum(axis=1, keepdims=True) * mean
+    if not joined:
+        return np.stack([matrix, fit.T], axis=1)
+    known = np.eye(1, 1 + trajectory.n_weights)
+    of_start = np.hstack([[[1.0]], -(fit @ before).T])
+    return np.stack([np.vstack([known, matrix]), np.vstack([of_start, np.pad(fit.T, ((0, 0), (1, 0)))])], axis=1)
 
 
 @lru_cache(maxsize=64)

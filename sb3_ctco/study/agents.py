@@ -1,5 +1,6 @@
 """From a run's settings to a model to train, and an environment to evaluate it in."""
 
+import pydoc
 from typing import Any
 
 from stable_baselines3.common.base_class import BaseAlgorithm
@@ -11,13 +12,22 @@ from sb3_ctco.study.grid import Run
 
 
 def constructor_arguments(run: Run) -> dict[str, Any]:
-    """The algorithm's arguments: numbers of seconds become numbers of steps, at the run's rate.
+    """The algorithm's arguments: numbers of seconds become numbers of steps, at the run's rate, and names become classes.
 
-    :raises ValueError: if an argument is unknown, or ``gamma``, ``gamma_dt`` or ``updates_per_second`` is missing
+    :raises ValueError: if an argument is unknown, or ``gamma``, ``gamma_dt`` or ``updates_per_second`` is missing, or there is
+        no such class
     """
     where = f"preset {run.preset}: {run.algorithm} ({run.setting})"
     episode_seconds = find_task(run.task).seconds_of_episode(run.rate)
-    return ALGORITHMS[run.algorithm].arguments(run.arguments, run.dt, episode_seconds, where)
+    arguments = ALGORITHMS[run.algorithm].arguments(run.arguments, run.dt, episode_seconds, where)
+    policy_kwargs = arguments.get("policy_kwargs", {})
+    if "features_extractor_class" in policy_kwargs:
+        name = policy_kwargs["features_extractor_class"]
+        extractor = pydoc.locate(name)
+        if extractor is None:
+            raise ValueError(f"{where}: there is no features_extractor_class {name}; give its full name, module.Class")
+        arguments["policy_kwargs"] = {**policy_kwargs, "features_extractor_class": extractor}
+    return arguments
 
 
 def discount_rate(run: Run) -> float:

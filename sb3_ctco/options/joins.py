@@ -1,0 +1,61 @@
+"""Observations that hold the action that is being sent, from which an option with a continuous join leaves.
+
+A vector of floating-point numbers gets it at its end, a dictionary an entry of its own; anything else, an image for
+instance, becomes a dictionary of two entries.
+"""
+
+from typing import Any
+
+import numpy as np
+from gymnasium import spaces
+
+from sb3_ctco.options.semi_mdp import FloatArray
+
+#: Its entry in a dictionary of observations, and in the info of a ``reset`` that tells it
+LAST_ACTION = "last_action"
+#: The entry of what was no dictionary and no vector
+OBSERVATION = "observation"
+
+
+def with_last_action_space(space: spaces.Space, action_dim: int) -> spaces.Space:
+    """The space of observations that hold the last action.
+
+    :param space: the environment's, of observations without it
+    :param action_dim: number of entries of an action
+    :raises ValueError: if the environment's own observations have an entry of that name
+    """
+    actions = spaces.Box(-1.0, 1.0, (action_dim,), np.float32)
+    if isinstance(space, spaces.Dict):
+        if LAST_ACTION in space.spaces:
+            raise ValueError(
+                f"join='continuous' adds the entry {LAST_ACTION!r} to observations, and the environment's have one of that "
+                "name: rename it, or pass join='free'"
+            )
+        return spaces.Dict({**space.spaces, LAST_ACTION: actions})
+    if isinstance(space, spaces.Box) and len(space.shape) == 1 and np.issubdtype(space.dtype, np.floating):
+        low, high = (np.append(bound, end) for bound, end in ((space.low, actions.low), (space.high, actions.high)))
+        return spaces.Box(low, high, dtype=space.dtype)  # type: ignore[arg-type]
+    return spaces.Dict({OBSERVATION: space, LAST_ACTION: actions})
+
+
+def without_last_action_space(space: spaces.Space, action_dim: int) -> spaces.Space:
+    """The environment's space, of the one that :func:`with_last_action_space` made of it."""
+    if isinstance(space, spaces.Box):
+        return spaces.Box(space.low[:-action_dim], space.high[:-action_dim], dtype=space.dtype)  # type: ignore[arg-type]
+    assert isinstance(space, spaces.Dict)
+    parts = {key: part for key, part in space.spaces.items() if key != LAST_ACTION}
+    return parts[OBSERVATION] if parts.keys() == {OBSERVATION} else spaces.Dict(parts)
+
+
+def with_last_action(space: spaces.Space, observation: Any, action: FloatArray) -> Any:
+    """An observation that holds the last action, or several with a leading axis.
+
+    :param space: of :func:`with_last_action_space`
+    :param observation: the environment's, ``[*shape]`` or ``[n, *shape]``, or a dictionary of such
+    :param action: normalised, ``[action_dim]`` or ``[n, action_dim]``
+    """
+    action = action.clip(-1.0, 1.0)  # rounding
+    if isinstance(space, spaces.Box):
+        return np.concatenate([observation, action.astype(space.dtype)], axis=-1)
+    parts = observation if isinstance(observation, dict) else {OBSERVATION: observation}
+    return {**parts, LAST_ACTION: action.astype(np.float32)}

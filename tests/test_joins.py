@@ -1,0 +1,598 @@
+"""Options that leave from the action that is being sent: plans, wrapper, sub-options, controller, files, real time."""
+
+import copy
+import itertools
+import json
+
+import gymnasium as gym
+import numpy as np
+import onnx
+import pytest
+import torch as th
+from gymnasium import spaces
+from gymnasium.utils.env_checker import check_env as gymnasium_check_env
+from hypothesis import given
+from hypothesis import strategies as st
+from hypothesis.extra import numpy as hnp
+from stable_baselines3.common.env_util import make_vec_env
+from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
+
+from sb3_ctco import CTCO, FiGARSAC, OptionController, OptionExecutionWrapper
+from sb3_ctco.checkpoint import load_checkpoint, save_checkpoint
+from sb3_ctco.controller import METADATA_KEY, OnnxPolicy
+from sb3_ctco.evaluation import evaluate_discounted_return, largest_jump, mean_absolute_jerk
+from sb3_ctco.export import export_onnx
+from sb3_ctco.options import (
+    LAST_ACTION,
+    TRAJECTORIES,
+    ActionBox,
+    BezierCurve,
+    OptionSpace,
+    RadialBasis,
+    with_last_action_space,
+)
+from sb3_ctco.vec_env import AsyncOptionVecEnv
+from sb3_ctco.wrappers import RealTimeOptionWrapper
+
+KINDS = TRAJECTORIES.values()
+POLICIES = {"vector": "MlpPolicy", "image": "MultiInputPolicy", "dict": "MultiInputPolicy"}
+SMALL = {"policy_kwargs": {"net_arch": [8]}, "batch_size": 8, "device": "cpu", "seed": 0, "buffer_size": 2000}
+
+
+def joined(env, **kwargs):
+    return OptionExecutionWrapper(env, **{"n_rbf": 2, "d_max": 1.5, "join": "continuous", **kwargs})
+
+
+# --- plans
+
+
+def test_plans_by_hand():
+    # One weight: from 0 to 1 in a straight line, whatever the trajectory; the phases are 1/4, 2/4, 3/4 and 1.
+    for kind in KINDS:
+        np.testing.assert_allclose(kind(1).plan([[1.0]], 4, [0.0])[:, 0], [0.25, 0.5, 0.75, 1.0])
+    # Control points 0, 1, −1: 2x(1−x) − x² at x = 1/2 and 1
+    np.testing.assert_allclose(BezierCurve(2).plan([[1.0, -1.0]], 2, [0.0])[:, 0], [0.25, -1.0])
+    # Halfway the action before counts (1/2)², and of the rest each of two bumps has half.
+    np.testing.assert_allclose(RadialBasis(2).plan([[0.8, 0.4]], 2, [-1.0])[0], [-0.25 + 0.75 * 0.6])
+
+
+@pytest.mark.parametrize("kind", KINDS)
+@given(
+    omega=hnp.arrays(np.float64, st.tuples(st.integers(1, 3), st.integers(1, 5)), elements=st.floats(-1, 1)),
+    start=st.floats(-1, 1),
+    n_steps=st.integers(1, 200),
+)
+def test_a_plan_is_a_mixture_of_its_weights_and_the_action_before(kind, omega, start, n_steps):
+    trajectory, start = kind(omega.shape[1]), np.full(omega.shape[0], start)
+    plan = trajectory.plan(omega, n_steps, start)
+    assert plan.shape == (n_steps, len(omega))
+    everything = np.column_stack([start, omega])
+    assert (plan <= everything.max(axis=1) + 1e-12).all()
+    assert (plan >= everything.min(axis=1) - 1e-12).all()
+    # At phase 0 it is the action before.
+    np.testing.assert_array_equal(trajectory.joined_basis(np.zeros(1)), np.eye(1, 1 + omega.shape[1]))
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_the_step_at_a_join_shrinks_with_dt_as_those_within_do(kind):
+    """Twice as many steps for the same options halve the largest step, which is not at a join."""
+    omegas = np.random.default_rng(0).uniform(-1, 1, (20, 2, 3))
+    largest, ratio = [], []
+    for n_steps in (50, 100, 200, 400):
+        plans, action = [], np.zeros(2)
+        for omega in omegas:
+            plans.append(kind(3).plan(omega, n_steps, action))
+            action = plans[-1][-1]
+        steps = np.abs(np.diff(np.vstack([np.zeros((1, 2)), *plans]), axis=0)).max(axis=1).reshape(20, n_steps)
+        largest.append(steps.max())
+        ratio.append(steps[1:, 0].max() / steps[:, 1:].max())
+        assert largest[-1] == largest_jump(np.vstack([np.zeros((1, 2)), *plans]))
+    for coarse, fine in itertools.pairwise(largest):
+        assert fine == pytest.approx(coarse / 2, rel=0.1)
+    assert max(ratio) < 1.1
+    # Options that begin anywhere jump by the same however small dt is.
+    free = [np.vstack([kind(3).plan(omega, n) for omega in omegas]) for n in (50, 400)]
+    assert largest_jump(free[1]) > 0.9 * largest_jump(free[0]) > 0.5
+
+
+def test_the_shortest_option_bounds_how_fast_actions_change():
+    """A Bézier curve of n + 1 points in [−1, 1] is no steeper than 2n over its duration."""
+    rng, n_steps = np.random.default_rng(0), 20
+    for _ in range(200):
+        start = rng.choice([-1.0, 1.0], 1)
+        plan = np.vstack([start, BezierCurve(3).plan(rng.choice([-1.0, 1.0], (1, 3)), n_steps, start)])
+        assert largest_jump(plan) <= 2 * 3 / n_steps + 1e-12
+
+
+# --- fits
+
+
+@pytest.mark.parametrize("kind", KINDS)
+@given(
+    omega=hnp.arrays(np.float64, st.tuples(st.integers(1, 3), st.integers(1, 4)), elements=st.floats(-1, 1)),
+    start=st.floats(-1, 1),
+    n_steps=st.integers(1, 60),
+)
+def test_a_fit_over_the_whole_option_returns_its_weights(kind, omega, start, n_steps):
+    trajectory, start = kind(omega.shape[1]), np.full(omega.shape[0], start)
+    plan = trajectory.plan(omega, n_steps, start)
+    [fitted], [residual] = trajectory.fit(plan, np.array([0]), np.array([n_steps]), start)
+    if n_steps >= omega.shape[1]:
+        assert residual < 1e-9
+    if n_steps >= 2 * omega.shape[1]:
+        np.testing.assert_allclose(fitted, omega, atol=1e-6)
+
+
+def test_a_stretch_leaves_from_the_action_before_its_first_step():
+    # From 0 to 1 in ten steps of 0.1: the steps 3 to 6 go from 0.3 to 0.7, so one weight of 0.7 plays them.
+    trajectory = BezierCurve(1)
+    plan = trajectory.plan([[1.0]], 10, [0.0])
+    omega, residuals = trajectory.fit(plan, np.array([3, 0, 9]), np.array([7, 1, 10]), np.zeros(1))
+    np.testing.assert_allclose(omega[:, 0, 0], [0.7, 0.1, 1.0])
+    np.testing.assert_allclose(residuals, 0.0, atol=1e-12)
+
+
+@given(
+    hnp.arrays(np.float64, st.tuples(st.integers(1, 2), st.integers(1, 4)), elements=st.floats(-1, 1)),
+    st.floats(-1, 1),
+    st.lists(st.tuples(st.integers(0, 29), st.integers(1, 30)), min_size=1),
+)
+def test_stretches_of_bezier_curves_are_exact(omega, start, stretches):
+    trajectory, start = BezierCurve(omega.shape[1]), np.full(len(omega), start)
+    plan = trajectory.plan(omega, 30, start)
+    firsts, lengths = np.array(stretches).T
+    ends = np.minimum(firsts + lengths, 30)
+    fitted, residuals = trajectory.fit(plan, firsts, ends, start)
+    for first, end, weights, residual in zip(firsts, ends, fitted, residuals, strict=True):
+        before = plan[first - 1] if first else start
+        played = trajectory.plan(weights, end - first, before)
+        assert np.abs(played - plan[first:end]).max() == pytest.approx(residual, abs=1e-12)
+        if end - first >= omega.shape[1]:
+            assert residual < 1e-8
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_canonical_weights_play_the_same_from_any_action(kind):
+    trajectory, rng = kind(3), np.random.default_rng(0)
+    matrices = trajectory.canonical(joined=True)
+    for n_steps in (1, 2, 3, 4):
+        matrix = matrices[min(n_steps, 3) - 1]
+        omega, start = rng.uniform(-1, 1, (2, 3)), rng.uniform(-1, 1, 2)
+        canonical = omega @ matrix.T
+        np.testing.assert_allclose(
+            trajectory.plan(canonical, n_steps, start), trajectory.plan(omega, n_steps, start), atol=1e-9
+        )
+        felt = trajectory.joined_basis((np.arange(n_steps) + 1) / n_steps)[:, 1:]
+        free = np.eye(3) - np.linalg.pinv(felt) @ felt
+        np.testing.assert_allclose((omega + rng.normal(size=(2, 3)) @ free) @ matrix.T, canonical, atol=1e-9)
+    # One step: all weights are the action.
+    np.testing.assert_allclose(omega @ matrices[0].T, trajectory.plan(omega, 1, start).T.repeat(3, axis=1), atol=1e-9)
+
+
+def test_settings():
+    space = OptionSpace.make(2, 0.5, 0.1, 0.1, 0.4, join="continuous")
+    assert OptionSpace.make(**space.arguments) == space
+    free = OptionSpace.make(2, 0.5, 0.1, 0.1, 0.4)
+    assert space.differences(free) == {"join": ("continuous", "free")}
+    with pytest.raises(ValueError, match=r"join must be one of \('free', 'continuous'\), not 'smooth'"):
+        OptionSpace.make(**{**space.arguments, "join": "smooth"})
+    with pytest.raises(ValueError, match="depends on the action before"):
+        space.plan(np.zeros(3))
+    with pytest.raises(ValueError, match="depends not on the action before"):
+        free.plan(np.zeros(3), np.zeros(1))
+
+
+def test_actions_are_normalised():
+    box = ActionBox(np.array([-2.0, 0.0, 1.0], np.float32), np.array([2.0, 10.0, 1.0], np.float32))
+    np.testing.assert_allclose(box.normalise([[1.0, 7.5, 1.0], [-2.0, 10.0, 1.0]]), [[0.5, 0.5, 0.0], [-1, 1, 0]])
+    matrix = ActionBox(np.full((2, 3), -3.0), np.full((2, 3), 1.0))
+    trajectory = np.random.default_rng(0).uniform(-1, 1, (4, 6))
+    np.testing.assert_allclose(matrix.normalise(matrix.actions(trajectory)), trajectory, atol=1e-12)
+
+
+# --- the wrapper
+
+
+def test_an_episode_by_hand(scripted_env):
+    """One weight and four steps: straight lines from 0 to 1, and from there to −1. The episode ends in the second."""
+    env = joined(scripted_env(truncate_at=6, action_space=spaces.Box(-2.0, 2.0, (1,), np.float32)), n_rbf=1, d_max=0.4)
+    assert env.observation_space == spaces.Box(np.float32([-1e6, -1e6, -1.0]), np.float32([1e6, 1e6, 1.0]))
+    obs, _ = env.reset()
+    np.testing.assert_array_equal(obs, [0, 0, 0])
+    np.testing.assert_allclose(env.plan([1.0, 1.0])[:, 0], [0.5, 1.0, 1.5, 2.0])
+    obs, *_ = env.step([1.0, 1.0])
+    np.testing.assert_allclose(np.ravel(env.unwrapped.actions), [0.5, 1.0, 1.5, 2.0])
+    # Observed are the steps, the action in its units, and normalised.
+    np.testing.assert_allclose(obs, [4, 2, 1])
+    assert obs.dtype == np.float32
+    obs, _, _, truncated, _ = env.step([-1.0, 1.0])
+    np.testing.assert_allclose(np.ravel(env.unwrapped.actions)[4:], [1.0, 0.0])
+    np.testing.assert_allclose(env.played[:, 0], [1.0, 0.0])
+    np.testing.assert_allclose(obs, [6, 0, 0])
+    assert truncated
+    np.testing.assert_array_equal(env.reset()[0], [0, 0, 0])
+
+
+def test_an_environment_may_say_what_is_being_sent(scripted_env):
+    class Env(scripted_env):
+        def reset(self, **kwargs):
+            return super().reset(**kwargs)[0], {LAST_ACTION: np.array([0.5])}
+
+    env = joined(Env(), n_rbf=1, d_max=0.2)
+    np.testing.assert_array_equal(env.reset()[0], [0, 0, 0.5])
+    env.step([1.0, 1.0])
+    np.testing.assert_allclose(np.ravel(env.unwrapped.actions), [0.75, 1.0])
+
+
+@pytest.mark.parametrize("kind", ["vector", "image", "dict"])
+def test_where_observations_hold_it(random_walk_env, kind):
+    env = joined(random_walk_env(kind))
+    gymnasium_check_env(env, skip_render_check=True)
+    env.reset(seed=0)
+    obs, *_ = env.step([0.5, -0.25, -1.0])
+    if kind == "vector":
+        assert obs.shape == (3,)
+        last = obs[-1:]
+    else:
+        assert set(obs) == {"image": {"observation"}, "dict": {"image", "vector"}}[kind] | {LAST_ACTION}
+        last = obs[LAST_ACTION]
+    np.testing.assert_allclose(last, env.played[-1] / 2.0, rtol=1e-6)
+
+
+def test_an_entry_of_that_name_is_refused():
+    space = spaces.Dict({LAST_ACTION: spaces.Box(-1, 1, (2,))})
+    with pytest.raises(ValueError, match="the environment's have one of that name"):
+        with_last_action_space(space, 2)
+
+
+def test_a_free_join_is_what_it_was(random_walk_env):
+    """With the same option vectors: the weights alone say where actions begin, and observations are the environment's."""
+    env, inside = OptionExecutionWrapper(random_walk_env(), n_rbf=2, d_max=1.5), random_walk_env()
+    assert env.observation_space == inside.observation_space
+    env.reset(seed=0)
+    option = np.array([0.5, -0.25, 0.0])
+    env.step(option)
+    np.testing.assert_array_equal(env.played, 2 * RadialBasis(2).plan([[0.5, -0.25]], 8).astype(np.float32))
+
+
+@pytest.mark.parametrize("trajectory", TRAJECTORIES)
+def test_sub_options_leave_from_the_action_before_them(random_walk_env, trajectory):
+    env = joined(random_walk_env(), n_rbf=3, trajectory=trajectory, n_sub_options=8, sub_option_tolerance=2.0)
+    env.action_space.seed(0)
+    residuals = []
+    for _ in range(20):
+        env.reset(seed=0)
+        done, sent = False, [0.0]
+        while not done:
+            *_, terminated, truncated, info = env.step(env.action_space.sample())
+            done, sub = terminated or truncated, info["sub_options"]
+            sent.extend(env.played[:, 0] / 2.0)
+            # An observation's second entry is the step within the episode, over 20, and its last one the action before.
+            first, end = (np.rint(20 * obs[:, 1]).astype(int) for obs in (sub.observations, sub.next_observations))
+            np.testing.assert_allclose(sub.observations[:, -1], np.array(sent)[first], atol=1e-6)
+            np.testing.assert_allclose(sub.next_observations[:, -1], np.array(sent)[end], atol=1e-6)
+            for i, option in enumerate(sub.options.astype(np.float64)):
+                again = env.option_space.plan(option, sub.observations[i, -1:].astype(np.float64))[:, 0]
+                assert len(again) == end[i] - first[i]
+                error = np.abs(again - sent[first[i] + 1 : end[i] + 1]).max()
+                assert error == pytest.approx(sub.residuals[i], abs=2e-6)
+                residuals.append(error if len(again) >= 3 else 0.0)
+    assert len(residuals) > 200
+    # Part of a polynomial is one of the same degree, from any action.
+    assert max(residuals) < (1e-5 if trajectory == "bezier" else 0.2)
+
+
+def test_time_that_a_free_join_does_not_spend(random_walk_env):
+    """Nothing is normalised where nobody needs it."""
+    env = OptionExecutionWrapper(random_walk_env())
+    env.reset(seed=0)
+    env.step(env.action_space.sample())
+    assert env._last_action is None
+
+
+# --- learning
+
+
+@pytest.mark.parametrize("kind", ["vector", "image", "dict"])
+def test_learns_from_each_kind_of_observation(random_walk_env, tmp_path, kind):
+    env = random_walk_env(kind)
+    model = CTCO(POLICIES[kind], env, join="continuous", d_max=0.5, learning_starts=50, gradient_steps=1, **SMALL).learn(80)
+    assert model._n_updates > 5
+    assert model.replay_buffer.size() > 1.5 * model.replay_buffer.n_decisions
+    model.save(tmp_path / "model.zip")
+    loaded = CTCO.load(tmp_path / "model.zip", env=random_walk_env(kind), device="cpu")
+    assert loaded.option_space == model.option_space
+    obs = loaded.get_env().reset()
+    np.testing.assert_array_equal(
+        loaded.predict(obs, deterministic=True)[0].vector, model.predict(obs, deterministic=True)[0].vector
+    )
+    loaded.learn(20, reset_num_timesteps=False)
+    with pytest.raises(ValueError, match=r"'join': 'free'.*cannot be changed while loading"):
+        CTCO.load(tmp_path / "model.zip", join="free")
+
+
+def test_settings_of_model_and_environment_agree(random_walk_env):
+    with pytest.raises(ValueError, match="the environment's options have join=continuous, CTCO has join=free"):
+        CTCO("MlpPolicy", joined(random_walk_env(), n_rbf=3, d_max=0.5), **SMALL)
+    arguments = {"join": "continuous", "gamma": 0.98, "gamma_dt": 0.05, "d_max": 0.4}
+    assert CTCO.wrapper_kwargs(arguments)["join"] == "continuous"
+    figar = {"gamma": 0.98, "gamma_dt": 0.05, "d_max": 0.4, "n_repetitions": None, "dt": None}
+    assert FiGARSAC.wrapper_kwargs(figar)["join"] == "free"
+
+
+@pytest.mark.parametrize("vec_env_cls", [DummyVecEnv, AsyncOptionVecEnv])
+def test_several_environments(random_walk_env, vec_env_cls):
+    kwargs = {"n_rbf": 3, "d_max": 0.5, "join": "continuous"}
+    env = make_vec_env(
+        random_walk_env, 2, wrapper_class=OptionExecutionWrapper, wrapper_kwargs=kwargs, vec_env_cls=vec_env_cls, seed=0
+    )
+    model = CTCO("MlpPolicy", env, join="continuous", learning_starts=50, gradient_steps=1, **SMALL).learn(150)
+    assert model._n_updates > 0
+    # An episode begins with the middle of the box.
+    steps = model.replay_buffer.observations[: model.replay_buffer.pos, 0, 1]
+    last = model.replay_buffer.observations[: model.replay_buffer.pos, 0, 2]
+    assert (last[steps == 0] == 0).all()
+    assert (np.abs(last[steps > 0]) > 0).mean() > 0.9
+    episodes = evaluate_discounted_return(model, env, 4, smoothness=True)
+    assert all(episode.largest_jump <= 2.0 for episode in episodes)
+    env.close()
+
+
+def test_a_training_goes_on_in_the_middle_of_an_episode(random_walk_env, tmp_path):
+    def make(env):
+        return CTCO("MlpPolicy", env, join="continuous", d_max=0.5, learning_starts=20, **SMALL)
+
+    model = make(random_walk_env()).learn(33)
+    save_checkpoint(model, tmp_path / "checkpoint")
+    model.learn(40, reset_num_timesteps=False)
+    loaded = load_checkpoint(CTCO, tmp_path / "checkpoint", random_walk_env(), device="cpu")
+    loaded.learn(40, reset_num_timesteps=False)
+    for name in ("observations", "actions"):
+        np.testing.assert_array_equal(getattr(loaded.replay_buffer, name), getattr(model.replay_buffer, name))
+
+
+def test_smoothness_of_a_policy(random_walk_env):
+    """Of the same weights, the actions of continuous joins have a smaller largest jump and jerk."""
+    found = {}
+    for join in ("free", "continuous"):
+        env = OptionExecutionWrapper(gym.make("Pendulum-v1"), n_rbf=2, d_min=0.5, d_max=0.5, join=join)
+        model = CTCO("MlpPolicy", env, n_rbf=2, d_min=0.5, d_max=0.5, join=join, buffer_size=10, seed=0, device="cpu")
+        env.reset(seed=0)
+        found[join] = evaluate_discounted_return(model, env, 1, deterministic=False, smoothness=True)[0]
+    assert found["continuous"].largest_jump < 0.6 * found["free"].largest_jump
+    assert found["continuous"].mean_absolute_jerk < found["free"].mean_absolute_jerk
+
+
+def test_largest_jump_by_hand():
+    assert largest_jump([[0.0, 1.0], [0.5, 0.75], [0.25, 0.0]]) == 0.75
+    assert np.isnan(largest_jump([[0.0]]))
+
+
+@pytest.mark.slow
+def test_pendulum_is_learned():
+    model = CTCO(
+        "MlpPolicy",
+        "Pendulum-v1",
+        join="continuous",
+        learning_rate=1e-3,
+        learning_starts=1000,
+        batch_size=128,
+        updates_per_second=20,
+        n_rbf=2,
+        d_max=0.3,
+        high_freq_penalty=0.01,
+        ent_coef="auto_0.1",
+        duration_ent_coef="auto_0.1",
+        policy_kwargs={"net_arch": [64, 64]},
+        seed=0,
+        device="cpu",
+    ).learn(10_000)
+    env = model.wrap_env(gym.make("Pendulum-v1"))
+    env.reset(seed=100)
+    episodes = evaluate_discounted_return(model, env, 10)
+    assert np.mean([episode.episode_return for episode in episodes]) > -300
+
+
+# --- the controller
+
+
+def trained(env, policy="MlpPolicy", **kwargs):
+    model = CTCO(policy, env, **{**SMALL, "join": "continuous", "n_rbf": 3, "d_max": 0.37, **kwargs})
+    # Untrained actors ask for weights near 0.
+    weights = model.actor.omega_head.bias.data[: model.actor.omega_dim]
+    weights.copy_(th.linspace(1.5, -1.0, len(weights)))
+    return model
+
+
+def through_wrapper(model, env, n_steps):
+    wrapped = model.wrap_env(env)
+    obs, _ = wrapped.reset(seed=5)
+    actions = []
+    while sum(map(len, actions)) < n_steps:
+        obs, _, terminated, truncated, _ = wrapped.step(model.predict(obs, deterministic=True)[0])
+        actions.append(wrapped.played)
+        if terminated or truncated:
+            obs, _ = wrapped.reset()
+    return np.concatenate(actions)[:n_steps]
+
+
+def through_controller(controller, env, n_steps, clock=False):
+    obs, _ = env.reset(seed=5)
+    actions, now = [], 0.0
+    for _ in range(n_steps):
+        actions.append(controller(obs, now if clock else None))
+        now += controller.dt
+        obs, _, terminated, truncated, _ = env.step(actions[-1])
+        if terminated or truncated:
+            controller.reset()
+            obs, _ = env.reset()
+    return np.array(actions)
+
+
+@pytest.mark.parametrize(("kind", "trajectory"), [("vector", "rbf"), ("vector", "bezier"), ("image", "rbf"), ("dict", "rbf")])
+def test_the_controller_plays_what_the_wrapper_does(random_walk_env, kind, trajectory):
+    model = trained(random_walk_env(kind), POLICIES[kind], trajectory=trajectory)
+    expected = through_wrapper(model, random_walk_env(kind), 50)
+    assert np.ptp(expected) > 0.5
+    np.testing.assert_array_equal(through_controller(OptionController(model), random_walk_env(kind), 50), expected)
+    by_clock = through_controller(OptionController(model), random_walk_env(kind), 50, clock=True)
+    np.testing.assert_allclose(by_clock, expected, atol=1e-5)
+
+
+@pytest.mark.parametrize("kind", ["vector", "image", "dict"])
+def test_several_robots(random_walk_env, kind):
+    """Each leaves from its own action, also after one of them was reset."""
+    model = trained(random_walk_env(kind), POLICIES[kind])
+    together, alone = OptionController(model), [OptionController(model) for _ in range(3)]
+    space = random_walk_env(kind).observation_space
+    space.seed(0)
+    for tick in range(20):
+        if tick == 9:
+            together.reset([1])
+            alone[1].reset()
+        observations = [space.sample() for _ in range(3)]
+        stacked = (
+            {key: np.stack([obs[key] for obs in observations]) for key in observations[0]}
+            if kind == "dict"
+            else np.stack(observations)
+        )
+        expected = [controller(obs) for controller, obs in zip(alone, observations, strict=True)]
+        np.testing.assert_allclose(together(stacked), expected, atol=1e-5)
+
+
+def test_the_first_option_leaves_from_what_is_being_sent(random_walk_env):
+    model = trained(random_walk_env(), n_rbf=1, d_min=0.4, d_max=0.4)
+    controller = OptionController(model)
+    controller.reset(last_action=np.array([2.0]))
+    obs, _ = random_walk_env().reset(seed=0)
+    actions = [float(controller(obs)[0]) for _ in range(4)]
+    # A straight line from 2 to the fourth action
+    np.testing.assert_allclose(actions, np.linspace(2.0, actions[-1], 5)[1:], atol=1e-6)
+    controller.reset()
+    actions = [float(controller(obs)[0]) for _ in range(4)]
+    np.testing.assert_allclose(actions, np.linspace(0.0, actions[-1], 5)[1:], atol=1e-6)
+
+
+def test_a_clock_with_fine_ticks_sends_no_jumps(random_walk_env):
+    model = trained(random_walk_env(), d_min=0.2)
+    obs, _ = random_walk_env().reset(seed=0)
+    jumps = {}
+    for ticks_per_step in (10, 20, 40):
+        controller = OptionController(model, dt=0.1 / ticks_per_step, safety=None)
+        actions = [controller(obs, now=i * controller.dt) for i in range(20 * ticks_per_step)]
+        jumps[ticks_per_step] = largest_jump(np.array(actions) / 2.0)
+    assert jumps[20] == pytest.approx(jumps[10] / 2, rel=0.15)
+    assert jumps[40] == pytest.approx(jumps[20] / 2, rel=0.15)
+
+
+@pytest.mark.parametrize("kind", ["vector", "image", "dict"])
+def test_an_exported_policy_plays_the_same(random_walk_env, tmp_path, kind):
+    model = trained(random_walk_env(kind), POLICIES[kind])
+    export_onnx(model, tmp_path / "model.onnx")
+    policy = OnnxPolicy(tmp_path / "model.onnx")
+    assert policy.option_space == model.option_space
+    expected = through_controller(OptionController(model), random_walk_env(kind), 30)
+    found = through_controller(OptionController(tmp_path / "model.onnx"), random_walk_env(kind), 30)
+    np.testing.assert_allclose(found, expected, atol=1e-4)
+    model.save(tmp_path / "model.zip")
+    from_zip = through_controller(OptionController(tmp_path / "model.zip"), random_walk_env(kind), 30)
+    np.testing.assert_array_equal(from_zip, expected)
+
+
+def test_an_exported_policy_that_does_not_tell_its_join_has_free_ones(tmp_path):
+    path = tmp_path / "model.onnx"
+    export_onnx(CTCO("MlpPolicy", "Pendulum-v1", buffer_size=10, seed=0), path)
+    file = onnx.load(path)
+    for entry in file.metadata_props:
+        if entry.key == METADATA_KEY:
+            data = json.loads(entry.value)
+            del data["option_space"]["join"]
+            entry.value = json.dumps(data)
+    onnx.save(file, path)
+    assert OnnxPolicy(path).option_space.join == "free"
+
+
+def test_observations_are_normalised_as_in_training(random_walk_env):
+    env = VecNormalize(DummyVecEnv([lambda: joined(random_walk_env(), n_rbf=3, d_max=0.37)]), norm_reward=False)
+    model = trained(env, learning_starts=1000)
+    model.learn(200)
+    assert env.obs_rms.mean.shape == (3,)
+    expected = through_normalised_wrapper(model, env, random_walk_env(), 20)
+    np.testing.assert_array_equal(through_controller(OptionController(model), random_walk_env(), 20), expected)
+
+
+def through_normalised_wrapper(model, vec_normalize, env, n_steps):
+    wrapped = model.wrap_env(env)
+    obs, _ = wrapped.reset(seed=5)
+    actions = []
+    while sum(map(len, actions)) < n_steps:
+        obs, *_ = wrapped.step(model.predict(vec_normalize.normalize_obs(obs), deterministic=True)[0])
+        actions.append(wrapped.played)
+    return np.concatenate(actions)[:n_steps]
+
+
+def test_a_controller_is_copied_with_what_it_sends(random_walk_env):
+    controller = OptionController(trained(random_walk_env()))
+    obs, _ = random_walk_env().reset(seed=0)
+    for _ in range(3):
+        controller(obs)
+    other = copy.deepcopy(controller)
+    np.testing.assert_array_equal([controller(obs) for _ in range(10)], [other(obs) for _ in range(10)])
+
+
+# --- real time
+
+
+@pytest.mark.parametrize("background", [False, True])
+def test_deciding_ahead_leaves_from_the_end_of_the_rest(scripted_env, background):
+    """The commands are those without deciding ahead, and the observation at a decision holds what they will have come to."""
+    options = [(1.0, 0.9), (-0.5, 0.3), (0.25, 1.0), (0.0, 0.0)]
+    kwargs = {"n_rbf": 1, "d_max": 1.0, "join": "continuous"}
+    plain = OptionExecutionWrapper(scripted_env(), **kwargs)
+    ahead = RealTimeOptionWrapper(scripted_env(), decide_ahead=0.3, background=background, **kwargs)
+    observations = {env: [env.reset()[0]] for env in (plain, ahead)}
+    played = []
+    for option in options:
+        for env, seen in observations.items():
+            seen.append(env.step(option)[0])
+        played.append(ahead.played)
+    ahead.abandon()
+    for one, other in zip(observations[plain], observations[ahead], strict=True):
+        assert one[-1] == other[-1]
+    commands, expected = np.ravel(ahead.unwrapped.actions), np.ravel(plain.unwrapped.actions)
+    shortest = min(len(commands), len(expected))
+    assert shortest > 20
+    np.testing.assert_array_equal(commands[:shortest], expected[:shortest])
+    # What a transition says was played is what was sent in its time.
+    sent = np.concatenate(played).ravel()
+    np.testing.assert_array_equal(sent, commands[: len(sent)])
+
+
+def test_an_interrupted_option_leaves_the_next_one_at_what_was_sent(scripted_env):
+    env = RealTimeOptionWrapper(
+        scripted_env(), interrupt=lambda before, obs, seconds: seconds > 0.35, n_rbf=1, d_max=1.0, join="continuous"
+    )
+    env.reset()
+    obs, *_, info = env.step([1.0, 1.0])
+    assert info["interrupted"]
+    np.testing.assert_allclose(env.played[:, 0], [0.1, 0.2, 0.3, 0.4], atol=1e-6)
+    np.testing.assert_allclose(obs, [4, 0.4, 0.4], atol=1e-6)
+    env.step([1.0, 1.0])
+    np.testing.assert_allclose(env.played[0, 0], 0.46, atol=1e-6)
+
+
+def test_jerk_of_a_joined_signal_grows_more_slowly_with_the_rate():
+    """A jump has a jerk of 1/dt³ at its steps, a bend one of 1/dt²."""
+    omegas = np.random.default_rng(0).uniform(-1, 1, (20, 1, 2))
+    jerks = {}
+    for n_steps in (50, 100):
+        plans, action = [], np.zeros(1)
+        for omega in omegas:
+            plans.append(BezierCurve(2).plan(omega, n_steps, action))
+            action = plans[-1][-1]
+        free = np.concatenate([BezierCurve(2).plan(omega, n_steps) for omega in omegas])
+        jerks[n_steps] = [mean_absolute_jerk(signal, 1.0 / n_steps) for signal in (np.concatenate(plans), free)]
+    (joined_slow, free_slow), (joined_fast, free_fast) = jerks[50], jerks[100]
+    # Steps at a join become rarer by 2.
+    assert free_fast / free_slow == pytest.approx(4.0, rel=0.1)
+    assert joined_fast / joined_slow == pytest.approx(2.0, rel=0.1)
