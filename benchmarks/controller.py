@@ -2,8 +2,8 @@
 
     python benchmarks/controller.py
 
-Prints microseconds a tick, median, 99th percentile and the worst one, between decisions and at decisions; and, where critics
-may end an option, at the ticks at which they are asked.
+Prints microseconds a tick, median, 99th percentile and the worst one, between decisions and at decisions; and, where the
+critics may end an option, at the ticks at which they are asked.
 """
 
 import tempfile

@@ -266,11 +266,9 @@ class _Execution:
 
     :param n_steps: after how many it is time to decide
     :param plan: its actions at a fixed rate
-    :param rows: likewise, one after the other
     :param weights: ω in the units of the actions, ``[n_rbf, action_dim]``, if they come by a clock; with a continuous join the
         action before is the first
-    :param before: the normalised action that it leaves from, with a continuous join
-    :param sent: the action of the last tick
+    :param sent: the action of the last tick; at a fixed rate, of the one before ``_rows``
     :param tick: how many of its ticks have passed
     :param start: when it began, by the caller's clock, in s
     :param checked: after how many steps a ValueInterrupt was asked
@@ -279,9 +277,7 @@ class _Execution:
     option: np.ndarray
     n_steps: int
     plan: np.ndarray
-    rows: list[np.ndarray]
     weights: np.ndarray
-    before: np.ndarray | None
     sent: np.ndarray
     tick: int = 0
     start: float = 0.0
@@ -292,9 +288,9 @@ class OptionController:
     """A trained policy as a controller: called once a control tick, it returns the action to apply until the next.
 
     It holds the option that runs, ω and d, and asks the policy for the next one when that has run out. Between two
-    decisions a tick at a fixed rate reads an action from memory and allocates nothing; the observation is not looked at. Who
-    gets an action may keep it: it is written once, when its option is decided on. The worst tick is one that decides
-    (``benchmarks/controller.py`` measures both).
+    decisions a tick at a fixed rate reads an action from memory and allocates nothing; the observation is not looked at,
+    unless an ``interrupt`` is asked. Who gets an action may keep it: it is written once, when its option is decided on. The
+    worst tick is one that decides (``benchmarks/controller.py`` measures both).
 
     Ticks come either at a fixed rate, ``controller(obs)`` every ``dt`` seconds, where ``dt`` may be another than in
     training; or whenever they come, ``controller(obs, now=t)`` with a clock of your own, in s. An option's duration is
@@ -307,7 +303,8 @@ class OptionController:
     Ticks by a clock are real time, and guarded (:class:`~sb3_ctco.safety.Safety`): changes of actions are limited, and the
     safe action takes their place while there is no fresh observation, or when the policy fails, by an exception or by
     numbers that are not finite. That is counted in ``replaced`` and logged, and no exception reaches the loop. Without a new
-    observation pass None. Ticks every ``dt`` are a simulation's, and are not guarded.
+    observation pass None. Ticks every ``dt`` are a simulation's, and are not guarded. With a continuous join an option leaves
+    from what was really sent.
 
     Example:
         >>> import gymnasium as gym
@@ -359,19 +356,20 @@ class OptionController:
         self.settings = trained if dt is None else replace(trained, dt=dt)
         self._trajectory = self.settings.trajectory
         self._box = ActionBox(self.policy.primitive_action_space.low, self.policy.primitive_action_space.high)
-        self._middle = self._first = self._box.actions(np.zeros((1, self._box.low.size)))[0]
+        self._middle = self._box.actions(np.zeros((1, self._box.low.size)))[0]
+        #: What is being sent where no option runs, ``[*action_shape]`` or ``[n, *action_shape]``; None if that is not known
+        self._first: np.ndarray | None = None
         self._longest = sys.maxsize if replan_period is None else steps_in(replan_period, self.dt)
         self._interrupt = interrupt
-        self._check_steps = 0 if interrupt is None else steps_in(interrupt.check_period, self.dt)
+        self._check_steps = sys.maxsize if interrupt is None else steps_in(interrupt.check_period, self.dt)
         self._executions: list[_Execution] = []
         self._several = False
         self._now: float | None = None
-        #: Actions of the ticks up to the next decision, and which of them is next
+        #: Actions of the ticks up to the next decision or check, and which of them is next
         self._rows: list[np.ndarray] = []
         self._next = 0
         self.safety = safety
         self._guard: Guard | None = None
-        self._last_action: npt.NDArray[Any] | None = None
         self._observed_at = -math.inf
         self._sent_at: float | None = None
         #: How many ticks by a clock sent the safe action, by reason
@@ -391,22 +389,22 @@ class OptionController:
         :param last_action: the action that is being sent, from which the first option leaves with a continuous join; by
             default the middle of the box, as in training
         """
-        first = self._middle if last_action is None else np.asarray(last_action, self._box.low.dtype)
+        first = None if last_action is None else np.asarray(last_action, self._box.low.dtype).reshape(self._box.low.shape)
+        self.decide_anew(which)
         if which is None:
             self._executions = []
-            self._first, self._last_action = first, last_action
+            self._first = first
             self._now = self._sent_at = self._guard = None
             self._observed_at = -math.inf
-        self._rows, self._next = [], 0
         for execution in self._chosen(which):
-            execution.n_steps, execution.sent = 0, first
+            execution.sent = self._middle if first is None else first
 
     def decide_anew(self, which: Sequence[int] | npt.NDArray[Any] | None = None) -> None:
         """Break the options off that run: the next tick decides anew, on from what is being sent.
 
         :param which: with several observations, those whose options to break off; all of them by default
         """
-        self._rows, self._next = [], 0
+        self._leave_rows()
         for execution in self._chosen(which):
             execution.n_steps = 0
 
@@ -414,6 +412,15 @@ class OptionController:
         if which is None or not self._executions:
             return self._executions
         return [self._executions[i] for i in np.atleast_1d(np.arange(len(self._executions))[np.asarray(which)])]
+
+    def _leave_rows(self) -> None:
+        if self._rows:
+            self._keep_sent(self._rows[self._next - 1])
+        self._rows, self._next = [], 0
+
+    def _keep_sent(self, actions: np.ndarray) -> None:
+        for execution, action in zip(self._executions, actions if self._several else [actions], strict=True):
+            execution.sent = action
 
     def __call__(
         self, observation: Observation | None, now: float | None = None, observed_at: float | None = None
@@ -427,8 +434,6 @@ class OptionController:
         :raises ValueError: if ``now`` is not finite, runs backwards, or is given at some ticks and not at others; or if
             the number of observations changes without a reset
         """
-        if observation is None and (now is None or self.safety is None):
-            raise ValueError("a tick without an observation must be by a clock, now=..., and guarded, safety=Safety()")
         executions = self._executions
         if executions:
             if (now is None) != (self._now is None):
@@ -442,21 +447,20 @@ class OptionController:
             now = float(now)
             if not (math.isfinite(now) and (self._now is None or now >= self._now)):
                 raise ValueError(f"now must be finite and must not run backwards, and it is {now} s after {self._now} s")
-            return self._at(observation, now) if self.safety is None else self._guarded(observation, now, observed_at)
+            if self.safety is not None:
+                return self._guarded(observation, now, observed_at)
+            actions = self._at(observation, now)
+            self._keep_sent(actions)
+            return actions
 
         if self._next == len(self._rows):
+            self._leave_rows()
             due = [i for i, e in enumerate(executions) if e.tick >= e.n_steps]
-            if self._interrupt is not None:
-                due = self._with_interrupted(observation, due, [e.tick for e in executions])
-            if due or not executions:
-                self._decide(observation, due, 0.0)
-                executions = self._executions
-            # Critics are asked in between.
-            n_ticks = 1 if self._interrupt is not None else min(e.n_steps - e.tick for e in executions)
-            plans = [e.rows[e.tick : e.tick + n_ticks] for e in executions]
-            self._rows, self._next = list(np.stack(plans, axis=1)) if self._several else plans[0], 0
-        for e in executions:
-            e.sent = e.rows[e.tick]
+            self._renew(observation, due, [e.tick for e in executions], 0.0)
+            n_ticks = min(min(e.n_steps - e.tick, e.checked + self._check_steps - e.tick) for e in self._executions)
+            plans = [e.plan[e.tick : e.tick + n_ticks] for e in self._executions]
+            self._rows = list(np.stack(plans, axis=1) if self._several else plans[0])
+        for e in self._executions:
             e.tick += 1
         self._next += 1
         return self._rows[self._next - 1]
@@ -465,11 +469,10 @@ class OptionController:
         assert self.safety is not None
         if observation is not None:
             self._observed_at = now if observed_at is None else observed_at
-        actions, reason = self._box.low, None
-        is_broken_off = not self._executions or any(e.n_steps == 0 for e in self._executions)
-        if now - self._observed_at > self.safety.stale_after or (observation is None and is_broken_off):
-            reason = "no fresh observation"
-        else:
+        age = now - self._observed_at
+        low, high = self._box.low, self._box.high
+        actions, reason = low, None if age <= self.safety.stale_after else "no fresh observation"
+        if reason is None:
             try:
                 actions = self._at(observation, now)
             except Exception as error:  # the policy's own, of any kind
@@ -477,50 +480,53 @@ class OptionController:
                 if not (self._guard is not None and self._guard.is_safe_action):
                     logger.error("the policy failed: %s: %s", type(error).__name__, error)
         if self._guard is None or (reason is None and self._guard.low.shape != actions.shape):
-            low, high = (np.broadcast_to(bound, actions.shape) for bound in (self._box.low, self._box.high))
-            self._guard = Guard(self.safety, low, high)
+            self._guard = Guard(self.safety, np.broadcast_to(low, actions.shape), np.broadcast_to(high, actions.shape))
             self._guard.replaced = self.replaced
-            if self._last_action is not None:
-                self._guard.start(np.broadcast_to(self._last_action, actions.shape))
+            self._guard.start(None if self._first is None else np.broadcast_to(self._first, actions.shape))
         seconds = self.dt if self._sent_at is None else now - self._sent_at
         self._now = self._sent_at = now
         command = self._guard.command(actions, seconds, reason=reason)
         if self._guard.is_safe_action:
-            self.decide_anew()
-        # From what is sent the next option leaves.
-        if not self._executions and command.shape == self._box.low.shape:
-            self._first = command
-        for i, e in enumerate(self._executions):
-            e.sent = command[i] if self._several else command
+            # Whatever comes next is decided anew, on from here.
+            self._executions, self._first = [], command
+        else:
+            self._keep_sent(command)
         return command
 
     def _at(self, observation: Observation | None, now: float) -> np.ndarray:
         dt = self.settings.dt
         due = [i for i, e in enumerate(self._executions) if now - e.start >= (e.n_steps - 0.5) * dt]
-        if self._interrupt is not None and observation is not None:
-            due = self._with_interrupted(observation, due, [round((now - e.start) / dt) for e in self._executions])
         # Without an observation an option holds its last action, as it does past its end at a late tick.
-        if (due and observation is not None) or not self._executions:
-            self._decide(observation, due, now)
+        if observation is not None or not self._executions:
+            self._renew(observation, due, [round((now - e.start) / dt) for e in self._executions], now)
         self._now = now
         # The action that an option leaves from is that of the tick before it.
         lead, basis = (dt, self._trajectory.joined_basis) if self.settings.joined else (0.0, self._trajectory.basis)
         phases = np.array([min((now - e.start + lead) / (len(e.plan) * dt), 1.0) for e in self._executions])
-        actions = self._box.cast(
-            np.array([row.dot(e.weights) for row, e in zip(basis(phases), self._executions, strict=True)])
-        )
-        for e, action in zip(self._executions, actions, strict=True):
-            e.sent = action
+        features = basis(phases)
+        actions = self._box.cast(np.array([row.dot(e.weights) for row, e in zip(features, self._executions, strict=True)]))
         return actions if self._several else actions[0]
 
-    def _decide(self, observation: Observation | None, due: list[int], now: float) -> None:
-        assert observation is not None  # see _guarded, which alone has none
+    def _renew(self, observation: Observation | None, due: list[int], ran: list[int], now: float) -> None:
+        """Decide on what comes after the options that are due, or that are broken off.
+
+        :param ran: how many steps of each have been played
+        """
+        if observation is None:
+            raise ValueError("the first tick, and each one at a fixed rate, needs an observation")
+        if self._interrupt is not None:
+            due = self._with_interrupted(observation, due, ran)
+        if due or not self._executions:
+            self._decide(observation, due, now)
+
+    def _decide(self, observation: Observation, due: list[int], now: float) -> None:
         if not self._executions:
             several = self.settings.joined and self._are_several(observation)
-            sent = [self._first] * (len(_first_leaf(observation)) if several else 1)
-            options = self._ask(observation, sent, several)
+            n = len(_first_leaf(observation)) if several else 1
+            options = self._ask(observation, self._firsts(n), several)
             self._several = options.ndim == 2
-            self._executions = [self._begin(option, self._first, now) for option in np.atleast_2d(options)]
+            options = np.atleast_2d(options)
+            self._executions = [self._begin(*both, now) for both in zip(options, self._firsts(len(options)), strict=True)]
             return
         if self._several and len(due) < len(self._executions):
             observation = _rows(observation, due)
@@ -529,22 +535,28 @@ class OptionController:
         for i, option, action in zip(due, options, sent, strict=True):
             self._executions[i] = self._begin(option, action, now)
 
-    def _with_interrupted(self, observation: Observation | None, due: list[int], ran: list[int]) -> list[int]:
+    def _firsts(self, n: int) -> list[np.ndarray]:
+        """What n first options leave from."""
+        return list(np.broadcast_to(self._middle if self._first is None else self._first, (n, *self._box.low.shape)))
+
+    def _with_interrupted(self, observation: Observation, due: list[int], ran: list[int]) -> list[int]:
         """Options that are due, and those whose rest is not worth playing.
 
         :param ran: how many steps of each have been played
         """
         asked, rests = [], []
         for i, (e, n_ran) in enumerate(zip(self._executions, ran, strict=True)):
-            if i in due or n_ran - e.checked < self._check_steps or len(e.plan) - n_ran < shortest_steps(self.settings):
+            if i in due or n_ran - e.checked < self._check_steps:
                 continue
             e.checked = n_ran
-            plan = self._box.normalise(e.plan)
-            rests.append(self.settings.stretch(plan, n_ran, len(plan), e.before)[0])
+            if len(e.plan) - n_ran < shortest_steps(self.settings):
+                continue
+            before = self._box.normalise([e.sent])[0] if self.settings.joined else None
+            rests.append(self.settings.closest(self._box.normalise(e.plan[n_ran:]), before)[0])
             asked.append(i)
         if not asked:
             return due
-        assert self._interrupt is not None and observation is not None
+        assert self._interrupt is not None
         seen: Any = _rows(observation, asked) if self._several else stack([observation])
         seen = self._as_seen(seen, [self._executions[i].sent for i in asked], several=True)
         worth_ending = self._interrupt.worth_ending(seen, np.array(rests))
@@ -578,7 +590,7 @@ class OptionController:
         plan = self._box.actions(self._trajectory.plan(omega, n_steps, start))
         # Features sum to one, so that actions are the same combination of weights in their own units.
         weights = self._box.scale(omega.T if start is None else np.vstack([start, omega.T]))
-        return _Execution(option, min(n_steps, self._longest), plan, list(plan), weights, start, sent=plan[0], start=now)
+        return _Execution(option, min(n_steps, self._longest), plan, weights, sent, start=now)
 
     @property
     def option(self) -> np.ndarray:

@@ -46,7 +46,7 @@ def minari_trajectories(dataset: Any, dt: float) -> Iterator[RecordedTrajectory]
         try:
             import minari  # noqa: PLC0415
         except ImportError as error:
-            raise ImportError("reading a Minari dataset needs minari: pip install 'sb3-ctco[minari]'") from error
+            raise ImportError("reading a Minari dataset needs minari: in a clone, pip install '.[minari]'") from error
         dataset = minari.load_dataset(dataset)
     for episode in dataset.iterate_episodes():
         ended = bool(episode.terminations[-1]), bool(episode.truncations[-1])
@@ -76,7 +76,7 @@ def lerobot_trajectories(
     try:
         from pyarrow import parquet  # noqa: PLC0415
     except ImportError as error:
-        raise ImportError("reading a LeRobot dataset needs pyarrow: pip install 'sb3-ctco[lerobot]'") from error
+        raise ImportError("reading a LeRobot dataset needs pyarrow: in a clone, pip install '.[lerobot]'") from error
     info = Path(folder) / "meta" / "info.json"
     files = sorted((Path(folder) / "data").glob("chunk-*/*.parquet"))
     if not info.exists() or not files:

@@ -4,6 +4,7 @@ from typing import Any
 
 import gymnasium as gym
 import numpy as np
+import torch as th
 from gymnasium import spaces
 from gymnasium.utils import RecordConstructorArgs
 from stable_baselines3 import SAC
@@ -13,7 +14,7 @@ from stable_baselines3.common.env_util import unwrap_wrapper
 from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback
 from stable_baselines3.common.vec_env import VecEnv
-from stable_baselines3.sac.policies import SACPolicy
+from stable_baselines3.sac.policies import LOG_STD_MAX, LOG_STD_MIN, SACPolicy
 
 from sb3_ctco.common.buffers import OptionReplayBuffer
 from sb3_ctco.common.callbacks import OptionProgressBarCallback, PrimitiveStepCallback
@@ -42,6 +43,54 @@ class FixedDurationWrapper(gym.ActionWrapper, RecordConstructorArgs):
     def plan(self, action: np.ndarray) -> np.ndarray:
         """The primitive actions that it plays, ``[n_steps, *action_shape]``."""
         return self.env.get_wrapper_attr("plan")(self.action(action))
+
+
+class QuickSACPolicy(SACPolicy):
+    """Stable-Baselines3's policy of SAC, quick at decisions: the same actions up to rounding, and the same random numbers.
+
+    A decision about one observation is nearly all overhead of PyTorch and Stable-Baselines3. Here the actor's layers are
+    evaluated by NumPy, on the parameters' own memory, so that updates need no copy. For an actor of linear layers and ReLU,
+    on the CPU, without gSDE, whose observations are vectors; Adam is fused.
+
+    :raises ValueError: for another actor
+    """
+
+    def __init__(self, *args: Any, **kwargs: Any):
+        kwargs["optimizer_kwargs"] = {"fused": True, **(kwargs.get("optimizer_kwargs") or {})}
+        super().__init__(*args, **kwargs)
+        activation, extractor = self.activation_fn.__name__, type(self.actor.features_extractor).__name__
+        if self.actor.use_sde or (activation, extractor) != ("ReLU", "FlattenExtractor"):
+            raise ValueError(
+                "QuickSACPolicy is for vectors, ReLU and no gSDE, not for "
+                f"{extractor}, {activation} and use_sde={self.actor.use_sde}: use SACPolicy"
+            )
+
+    def set_training_mode(self, mode: bool) -> None:
+        """Stable-Baselines3 asks for a mode at each decision: nothing here depends on it."""
+
+    def predict(
+        self,
+        observation: np.ndarray | dict[str, np.ndarray],
+        state: tuple[np.ndarray, ...] | None = None,
+        episode_start: np.ndarray | None = None,
+        deterministic: bool = False,
+    ) -> tuple[np.ndarray, tuple[np.ndarray, ...] | None]:
+        """Stable-Baselines3's ``predict``."""
+        assert isinstance(observation, np.ndarray)
+        x = observation.reshape(-1, self.actor.features_dim).astype(np.float32)
+        layers: Any = self.actor.latent_pi
+        for layer in layers[0::2]:
+            x = np.maximum(_affine(layer, x), 0.0)
+        gaussian = _affine(self.actor.mu, x)
+        if not deterministic:
+            log_std = _affine(self.actor.log_std, x).clip(LOG_STD_MIN, LOG_STD_MAX)
+            gaussian += np.exp(log_std) * th.randn(gaussian.shape).numpy()
+        actions = self.unscale_action(np.tanh(gaussian))
+        return actions if observation.ndim > 1 else actions[0], state
+
+
+def _affine(layer: Any, x: np.ndarray) -> np.ndarray:
+    return x @ layer.weight.detach().numpy().T + layer.bias.detach().numpy()
 
 
 class _SACOnOptions(SAC):

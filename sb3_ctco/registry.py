@@ -20,7 +20,7 @@ from sb3_ctco.common.option_algorithm import OptionOffPolicyAlgorithm
 from sb3_ctco.ctco import CTCO
 from sb3_ctco.dac_ppo import DACPPO
 from sb3_ctco.figar_sac import FiGARSAC
-from sb3_ctco.fixed_rate import FixedDurationWrapper, hold_actions, sac_at_rate
+from sb3_ctco.fixed_rate import FixedDurationWrapper, QuickSACPolicy, hold_actions, sac_at_rate
 from sb3_ctco.options import OptionSpace, discount_rate_from_gamma
 from sb3_ctco.wrappers import OptionExecutionWrapper, RewardRateWrapper, find_dt
 
@@ -161,6 +161,11 @@ def _with_reward_rate(make_env: Callable[[], gym.Env], dt: float, discount_rate:
     return DummyVecEnv([lambda: RewardRateWrapper(Monitor(make_env()), dt=dt, discount_rate=discount_rate)] * n_envs)
 
 
+def _make_sac(make_env: Callable[[], gym.Env], dt: float, arguments: dict[str, Any]) -> SAC:
+    other_noise = arguments.get("use_sde") or arguments.get("pink_noise_seconds") is not None
+    return sac_at_rate(make_env(), dt=dt, policy="MlpPolicy" if other_noise else QuickSACPolicy, **arguments)
+
+
 def _make_sac_eval_env(model: SAC, make_env: Callable[[], gym.Env], dt: float, discount_rate: float) -> VecEnv:
     env = model.get_env()
     assert env is not None
@@ -181,7 +186,7 @@ def _action_repeat_in_seconds(arguments: dict[str, Any], dt: float, episode_seco
 #: Of stock SAC and what practitioners do about high rates: rows that differ in their arguments alone, told apart in figures
 _SAC: dict[str, Any] = {
     "constructors": (sac_at_rate, SAC),
-    "make": lambda make_env, dt, arguments: sac_at_rate(make_env(), dt=dt, **arguments),
+    "make": _make_sac,
     "make_eval_env": _make_sac_eval_env,
     "in_steps": _action_repeat_in_seconds,
 }
@@ -190,7 +195,7 @@ _SAC: dict[str, Any] = {
 def _make_dac_ppo(make_env: Callable[[], gym.Env], dt: float, arguments: dict[str, Any]) -> DACPPO:
     discount_rate = discount_rate_from_gamma(arguments["gamma"], arguments["gamma_dt"])
     env = _with_reward_rate(make_env, dt, discount_rate, arguments.pop("n_envs", 1))
-    return DACPPO("MlpPolicy", VecNormalize(env, norm_reward=False), **arguments)
+    return DACPPO(env=VecNormalize(env, norm_reward=False), **{"policy": "MlpPolicy", **arguments})
 
 
 def _make_dac_ppo_eval_env(model: DACPPO, make_env: Callable[[], gym.Env], dt: float, discount_rate: float) -> VecEnv:

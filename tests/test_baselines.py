@@ -261,5 +261,5 @@ def test_the_zoo_needs_seconds_for_repetitions():
     with pytest.raises(ValueError, match="pass d_max, in seconds, or dt"):
         FiGARSAC.wrapper_kwargs(arguments)
     kwargs = FiGARSAC.wrapper_kwargs({**arguments, "dt": 0.1})
-    assert (kwargs["n_rbf"], kwargs["d_max"], kwargs["d_min"], kwargs["dt"]) == (1, 0.4, None, 0.1)
+    assert (kwargs["n_rbf"], kwargs["d_max"], kwargs["d_min"], kwargs["dt"]) == (1, 0.4, 0.0, 0.1)
     assert FiGARSAC.wrapper_kwargs({**arguments, "n_repetitions": None, "d_max": 0.3})["d_max"] == 0.3

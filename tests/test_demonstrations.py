@@ -15,14 +15,14 @@ from stable_baselines3.common.save_util import load_from_pkl, save_to_pkl
 
 from sb3_ctco import CTCO, DictOptionReplayBuffer, OptionReplayBuffer
 from sb3_ctco.datasets import lerobot_trajectories, minari_trajectories
-from sb3_ctco.options import OptionSpace, integrated_reward, with_last_action_space, without_last_action_space
+from sb3_ctco.options import OptionSpace, integrated_reward, with_last_action_space
 
 TAU = math.log(2.0)
 ACTIONS = spaces.Box(np.array([-2.0, 0.0], np.float32), np.array([2.0, 1.0], np.float32))
 STEPS = spaces.Box(-np.inf, np.inf, (1,), np.float32)
 
 
-def make_buffer(size=10_000, n_rbf=2, d_min=0.1, d_max=0.5, space=STEPS, join="free", **kwargs):
+def make_buffer(size=10_000, n_rbf=2, d_min=0.1, d_max=0.5, space=STEPS, **kwargs):
     """A buffer of options of an environment with a step of 0.1 s."""
     kind = DictOptionReplayBuffer if isinstance(space, spaces.Dict) else OptionReplayBuffer
     return kind(
@@ -31,7 +31,7 @@ def make_buffer(size=10_000, n_rbf=2, d_min=0.1, d_max=0.5, space=STEPS, join="f
         spaces.Box(-1.0, 1.0, (2 * n_rbf + 1,), np.float32),
         device="cpu",
         discount_rate=TAU,
-        option_space=OptionSpace.make(n_rbf, d_max, d_min, 0.1, TAU, join=join),
+        option_space=OptionSpace.make(n_rbf, d_max, d_min, 0.1, TAU),
         primitive_action_space=ACTIONS,
         **kwargs,
     )
@@ -88,31 +88,6 @@ def test_accounting_equals_what_was_recorded(dt, unit, terminated, truncated):
     assert residual == pytest.approx(max(residuals), abs=1e-6)
     assert ended >= 3
     assert added > 150
-
-
-def test_with_a_continuous_join_each_option_leaves_from_the_action_before_it():
-    observations, actions, rewards = recording(60)
-    space = with_last_action_space(STEPS, 2)
-    buffer = make_buffer(space=space, join="continuous")
-    result = buffer.add_trajectory(observations, actions, rewards, True, False, 0.1)
-    assert 50 < result.added < 60
-    normalised = (actions - [0.0, 0.5]) / [2.0, 0.5]
-    for row in demonstrations(buffer):
-        obs, next_obs = buffer.observations[row, 0], buffer.next_observations[row, 0]
-        first, last = int(obs[0]), int(next_obs[0])
-        assert 1 <= first < last <= 60
-        np.testing.assert_allclose(obs[1:], normalised[first - 1], atol=1e-6)
-        np.testing.assert_allclose(next_obs[1:], normalised[last - 1], atol=1e-6)
-        plan = buffer.option_space.plan(buffer.actions[row, 0].astype(np.float64), normalised[first - 1])
-        np.testing.assert_allclose(plan, normalised[first:last], atol=result.largest_residual + 1e-6)
-        expected = integrated_reward(rewards[first:last], 0.1, TAU)
-        assert buffer.integrated_rewards[row, 0] == pytest.approx(expected, abs=1e-6)
-    assert buffer.add_trajectory(observations[:2], actions[:1], rewards[:1], True, False, 0.1) == (0, 0, 0.0)
-
-
-@pytest.mark.parametrize("space", [STEPS, spaces.Dict({"a": STEPS}), spaces.Box(0, 255, (3, 4, 5), np.uint8)])
-def test_a_space_with_the_last_action_without_it(space):
-    assert without_last_action_space(with_last_action_space(space, 2), 2) == space
 
 
 def test_one_weight_plays_a_constant_action_exactly():
@@ -403,3 +378,27 @@ def test_lerobot_datasets_are_read(tmp_path, one_file_an_episode):
         next(lerobot_trajectories(tmp_path, "observation.images.front"))
     with pytest.raises(FileNotFoundError, match=r"meta/info\.json"):
         next(lerobot_trajectories(tmp_path / "data"))
+
+
+@pytest.mark.parametrize("kind", ["vector", "dict"])
+def test_with_a_continuous_join_stretches_leave_from_the_action_before_them(kind):
+    space = OptionSpace.make(2, 0.5, 0.1, 0.1, TAU, "bezier", join="continuous")
+    bare = STEPS if kind == "vector" else spaces.Dict({"q": STEPS})
+    buffer = make_buffer(space=with_last_action_space(bare, 2))
+    buffer.option_space = space
+    observations, actions, rewards = recording(40)
+    added = buffer.add_trajectory(
+        observations if kind == "vector" else {"q": observations}, actions, rewards, False, True, 0.1
+    )
+    assert added.added > 30
+    sent = np.vstack([np.zeros(2), actions / [2.0, 0.5] - [0.0, 1.0]])
+    for row in demonstrations(buffer):
+        stored = buffer.observations if kind == "vector" else buffer.observations["q"]
+        first = int(stored[row, 0, 0])
+        last = buffer.observations[row, 0, 1:] if kind == "vector" else buffer.observations["last_action"][row, 0]
+        np.testing.assert_allclose(last, sent[first], atol=1e-6)
+        plan = space.plan(buffer.actions[row, 0].astype(np.float64), sent[first])
+        assert np.abs(plan - sent[first + 1 : first + 1 + len(plan)]).max() <= added.largest_residual + 1e-6
+    with pytest.raises(ValueError, match="n actions, n rewards and n \\+ 1 observations"):
+        wrong = observations[:-1] if kind == "vector" else {"q": observations[:-1]}
+        buffer.add_trajectory(wrong, actions, rewards, False, True, 0.1)

@@ -44,9 +44,9 @@ def plain(model):
         {"policy_kwargs": {"net_arch": [8], "optimizer_kwargs": {"betas": (0.8, 0.9), "eps": 1e-5, "weight_decay": 0.1}}},
         {"d_min": 0.1, "d_max": 0.1},
         {"n_rbf": 3, "d_max": 0.15},
-        {"n_rbf": 3, "d_max": 0.15, "canonical_weights": True},
-        {"n_rbf": 3, "d_max": 0.15, "canonical_weights": True, "join": "continuous"},
-        {"n_rbf": 3, "d_max": 0.3, "duration_scale": "log", "trajectory": "bezier", "canonical_weights": True},
+        {"n_rbf": 3, "d_max": 0.15, "canonical_options": True},
+        {"n_rbf": 3, "d_max": 0.15, "canonical_options": True, "join": "continuous"},
+        {"n_rbf": 3, "d_max": 0.3, "duration_scale": "log", "trajectory": "bezier", "canonical_options": True},
     ],
 )
 def test_an_update_is_that_of_autograd(kwargs):

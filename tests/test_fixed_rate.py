@@ -5,6 +5,7 @@ import sys
 import gymnasium as gym
 import numpy as np
 import pytest
+import torch as th
 from hypothesis import given
 from hypothesis import strategies as st
 from stable_baselines3 import SAC
@@ -14,7 +15,7 @@ from stable_baselines3.common.monitor import Monitor
 from sb3_ctco import OptionExecutionWrapper, RewardRateWrapper, sac_at_rate
 from sb3_ctco import fixed_rate as module
 from sb3_ctco.evaluation import DiscountedReturnCallback, evaluate_discounted_return
-from sb3_ctco.fixed_rate import hold_actions, update_schedule
+from sb3_ctco.fixed_rate import QuickSACPolicy, hold_actions, update_schedule
 from sb3_ctco.options import DEFAULT_DISCOUNT_RATE
 from sb3_ctco.wrappers import reward_rate
 
@@ -266,6 +267,32 @@ def test_learning_goes_on_at_the_same_rate_of_updates(scripted_env):
     assert model.learn(30)._n_updates == pytest.approx(20 * 2, abs=4)
     assert model.learn(30, reset_num_timesteps=False)._n_updates == pytest.approx(20 * 5, abs=4)
     assert model.learn(30)._n_updates == pytest.approx(20 * 7, abs=8)
+
+
+@pytest.mark.parametrize("hold", [None, 0.3])
+def test_the_quick_policy_is_the_same_sac(random_walk_env, hold):
+    """The same actions from the same random numbers, in training and greedily, and so the same weights."""
+    arguments = {**SMALL, "policy_kwargs": {"net_arch": {"pi": [8, 6], "qf": [16]}}, "learning_starts_seconds": 2.0}
+    stock, quick = (
+        sac_at_rate(random_walk_env(), 0.1, policy=policy, hold_seconds=hold, **arguments).learn(120)
+        for policy in ("MlpPolicy", QuickSACPolicy)
+    )
+    assert stock._n_updates == quick._n_updates > 100
+    for name, value in stock.policy.state_dict().items():
+        np.testing.assert_allclose(quick.policy.state_dict()[name], value, rtol=1e-3, atol=1e-4, err_msg=name)
+    n = min(stock.replay_buffer.pos, quick.replay_buffer.pos)
+    np.testing.assert_allclose(stock.replay_buffer.actions[:n], quick.replay_buffer.actions[:n], atol=1e-4)
+    obs = np.random.default_rng(0).uniform(-1, 1, (5, 2)).astype(np.float32)
+    quick.policy.load_state_dict(stock.policy.state_dict())
+    for one in (obs, obs[0]):
+        actions = (model.predict(one, deterministic=True)[0] for model in (quick, stock))
+        np.testing.assert_allclose(*actions, atol=1e-6)
+
+
+def test_the_quick_policy_refuses_what_it_cannot_do(scripted_env):
+    for kwargs in ({"use_sde": True}, {"policy_kwargs": {"net_arch": [8], "activation_fn": th.nn.Tanh}}):
+        with pytest.raises(ValueError, match=r"for vectors, ReLU and no gSDE, not for FlattenExtractor, .*: use SACPolicy"):
+            sac_at_rate(scripted_env(), 0.1, policy=QuickSACPolicy, **{**SMALL, **kwargs})
 
 
 def test_pink_noise_stays_on_one_side_for_longer(scripted_env):

@@ -199,7 +199,7 @@ def test_the_controller_ends_what_the_wrapper_ends(scripted_env, join, clock):
     for _ in range(4):
         obs, *_ = env.step(model.predict(obs, deterministic=True)[0])
     bare = scripted_env()
-    controller = OptionController(model, interrupt=here)
+    controller = OptionController(model, interrupt=here, safety=None)
     obs, _ = bare.reset()
     for tick in range(env.unwrapped.count):
         obs, *_ = bare.step(controller(obs, tick * DT if clock else None))
@@ -248,7 +248,7 @@ def test_replanning(toy, scripted_env):
     # The plan is that of the whole option, by the clock too.
     model = model_for(scripted_env(), join="continuous")
     for now in (None, 0.0):
-        controller = OptionController(model, replan_period=0.2)
+        controller = OptionController(model, replan_period=0.2, safety=None)
         actions = [float(controller(np.zeros(2), now if now is None else k * DT)[0]) for k in range(3)]
         # A tenth of the way to 0.5 with each step, from where it is
         np.testing.assert_allclose(actions, [0.05, 0.1, 0.14], atol=1e-6)

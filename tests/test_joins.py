@@ -116,7 +116,7 @@ def test_the_shortest_option_bounds_how_fast_actions_change():
 def test_a_fit_over_the_whole_option_returns_its_weights(kind, omega, start, n_steps):
     trajectory, start = kind(omega.shape[1]), np.full(omega.shape[0], start)
     plan = trajectory.plan(omega, n_steps, start)
-    [fitted], [residual] = trajectory.fit(plan, np.array([0]), np.array([n_steps]), start)
+    [fitted], [residual] = trajectory.fit(plan, np.array([0]), np.array([n_steps]), start[None])
     if n_steps >= omega.shape[1]:
         assert residual < 1e-9
     if n_steps >= 2 * omega.shape[1]:
@@ -127,7 +127,7 @@ def test_a_stretch_leaves_from_the_action_before_its_first_step():
     # From 0 to 1 in ten steps of 0.1: the steps 3 to 6 go from 0.3 to 0.7, so one weight of 0.7 plays them.
     trajectory = BezierCurve(1)
     plan = trajectory.plan([[1.0]], 10, [0.0])
-    omega, residuals = trajectory.fit(plan, np.array([3, 0, 9]), np.array([7, 1, 10]), np.zeros(1))
+    omega, residuals = trajectory.fit(plan, np.array([3, 0, 9]), np.array([7, 1, 10]), np.array([[0.3], [0.0], [0.9]]))
     np.testing.assert_allclose(omega[:, 0, 0], [0.7, 0.1, 1.0])
     np.testing.assert_allclose(residuals, 0.0, atol=1e-12)
 
@@ -142,9 +142,9 @@ def test_stretches_of_bezier_curves_are_exact(omega, start, stretches):
     plan = trajectory.plan(omega, 30, start)
     firsts, lengths = np.array(stretches).T
     ends = np.minimum(firsts + lengths, 30)
-    fitted, residuals = trajectory.fit(plan, firsts, ends, start)
-    for first, end, weights, residual in zip(firsts, ends, fitted, residuals, strict=True):
-        before = plan[first - 1] if first else start
+    starts = np.vstack([start, plan])[firsts]
+    fitted, residuals = trajectory.fit(plan, firsts, ends, starts)
+    for first, end, before, weights, residual in zip(firsts, ends, starts, fitted, residuals, strict=True):
         played = trajectory.plan(weights, end - first, before)
         assert np.abs(played - plan[first:end]).max() == pytest.approx(residual, abs=1e-12)
         if end - first >= omega.shape[1]:
@@ -222,6 +222,22 @@ def test_an_environment_may_say_what_is_being_sent(scripted_env):
     np.testing.assert_array_equal(env.reset()[0], [0, 0, 0.5])
     env.step([1.0, 1.0])
     np.testing.assert_allclose(np.ravel(env.unwrapped.actions), [0.75, 1.0])
+
+
+@pytest.mark.parametrize("n_sub_options", [0, 4])
+def test_an_environment_may_send_something_else(scripted_env, n_sub_options):
+    class Limited(scripted_env):
+        def step(self, action):
+            *result, info = super().step(np.minimum(action, 0.5))
+            return *result, {**info, LAST_ACTION: self.actions[-1]}
+
+    env = joined(Limited(), n_rbf=1, d_max=0.4, n_sub_options=n_sub_options)
+    env.reset(seed=0)
+    obs, *_, info = env.step([1.0, 1.0])
+    assert obs[-1] == 0.5
+    if n_sub_options:
+        assert (info["sub_options"].seen[-1] == obs).all()
+    np.testing.assert_allclose(env.plan([1.0, 1.0])[:, 0], [0.625, 0.75, 0.875, 1.0])
 
 
 @pytest.mark.parametrize("kind", ["vector", "image", "dict"])
@@ -313,7 +329,7 @@ def test_learns_from_each_kind_of_observation(random_walk_env, tmp_path, kind):
 
 def test_settings_of_model_and_environment_agree(random_walk_env):
     with pytest.raises(ValueError, match="the environment's options have join=continuous, CTCO has join=free"):
-        CTCO("MlpPolicy", joined(random_walk_env(), n_rbf=3, d_max=0.5), **SMALL)
+        CTCO("MlpPolicy", joined(random_walk_env(), n_rbf=3, d_max=0.5), d_max=0.5, **SMALL)
     arguments = {"join": "continuous", "gamma": 0.98, "gamma_dt": 0.05, "d_max": 0.4}
     assert CTCO.wrapper_kwargs(arguments)["join"] == "continuous"
     figar = {"gamma": 0.98, "gamma_dt": 0.05, "d_max": 0.4, "n_repetitions": None, "dt": None}
@@ -326,7 +342,7 @@ def test_several_environments(random_walk_env, vec_env_cls):
     env = make_vec_env(
         random_walk_env, 2, wrapper_class=OptionExecutionWrapper, wrapper_kwargs=kwargs, vec_env_cls=vec_env_cls, seed=0
     )
-    model = CTCO("MlpPolicy", env, join="continuous", learning_starts=50, gradient_steps=1, **SMALL).learn(150)
+    model = CTCO("MlpPolicy", env, join="continuous", d_max=0.5, learning_starts=50, gradient_steps=1, **SMALL).learn(150)
     assert model._n_updates > 0
     # An episode begins with the middle of the box.
     steps = model.replay_buffer.observations[: model.replay_buffer.pos, 0, 1]
@@ -375,7 +391,7 @@ def test_pendulum_is_learned():
         "Pendulum-v1",
         join="continuous",
         learning_rate=1e-3,
-        learning_starts=1000,
+        learning_starts=500,
         batch_size=128,
         updates_per_second=20,
         n_rbf=2,
@@ -386,7 +402,7 @@ def test_pendulum_is_learned():
         policy_kwargs={"net_arch": [64, 64]},
         seed=0,
         device="cpu",
-    ).learn(10_000)
+    ).learn(6_000)
     env = model.wrap_env(gym.make("Pendulum-v1"))
     env.reset(seed=100)
     episodes = evaluate_discounted_return(model, env, 10)
@@ -435,7 +451,7 @@ def test_the_controller_plays_what_the_wrapper_does(random_walk_env, kind, traje
     expected = through_wrapper(model, random_walk_env(kind), 50)
     assert np.ptp(expected) > 0.5
     np.testing.assert_array_equal(through_controller(OptionController(model), random_walk_env(kind), 50), expected)
-    by_clock = through_controller(OptionController(model), random_walk_env(kind), 50, clock=True)
+    by_clock = through_controller(OptionController(model, safety=None), random_walk_env(kind), 50, clock=True)
     np.testing.assert_allclose(by_clock, expected, atol=1e-5)
 
 

@@ -473,3 +473,23 @@ def test_time_limit_inside_counts_primitive_steps(scripted_env):
     _, _, _, truncated, info = env.step([0.0, 1.0])
     assert truncated
     assert info["option"]["n_steps"] == 2
+
+
+@pytest.mark.parametrize(
+    ("dt", "gamma", "gamma_dt", "expected"),
+    [
+        (0.002, 0.98, 0.05, (0.025, 0.5)),  # 500 Hz, the paper's discount
+        (0.05, 0.98, 0.05, (0.05, 0.5)),  # a step is longer
+        (0.008, 0.99, 0.008, (0.008, 0.1608)),  # SAC's discount at 125 Hz
+        (0.05, 0.999, 0.05, (0.05, 0.5)),  # 50 s ahead, but not an option of 10 s
+        (0.002, 1.0, 0.05, (0.025, 0.5)),
+    ],
+)
+def test_durations_follow_from_rate_and_discount(scripted_env, dt, gamma, gamma_dt, expected):
+    model = CTCO("MlpPolicy", scripted_env(dt=dt), gamma=gamma, gamma_dt=gamma_dt, device="cpu")
+    space = model.option_space
+    assert (space.d_min, space.d_max) == pytest.approx(expected, abs=5e-4)
+    wrapped = OptionExecutionWrapper(scripted_env(dt=dt), discount_rate=model.discount_rate)
+    assert wrapped.option_space == space
+    assert CTCO("MlpPolicy", wrapped, gamma=gamma, gamma_dt=gamma_dt, device="cpu").option_space == space
+    assert OptionExecutionWrapper(scripted_env(dt=dt), d_min=0.0).option_space.d_min == dt

@@ -37,7 +37,7 @@ def test_deviations_are_those_of_the_code():
         ("duration_ent_coef", "auto_0.02", "learned by dual ascent from 0.02"),
         ("learning_starts", 100, "`learning_starts=100` steps play random options"),
         ("learning_rate", 3e-4, "Adam, 3e-4"),
-        ("d_max", None, "| ten `gamma_dt`, 0.5 s | `d_max` |"),
+        ("d_max", None, "| a fifth of the horizon 1/τ, 0.5 s | `d_max` |"),
         ("tau", 0.005, "both targets with 0.005"),
         ("buffer_size", 1_000_000, "a buffer of 1,000,000"),
     ]:
@@ -55,6 +55,9 @@ def test_deviations_are_those_of_the_code():
         "reward_scale",
         "trajectory",
         "duration_scale",
+        "join",
+        "canonical_options",
+        "d_min",
     }
     assert defaults["high_freq_penalty"] == 0.003
     assert f"clamped to [−{-LOG_STD_MIN:.0f}, {LOG_STD_MAX:.0f}]" in TEXT

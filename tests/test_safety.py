@@ -10,7 +10,7 @@ from gymnasium import spaces
 from sb3_ctco import OptionController
 from sb3_ctco.options import OptionSpace
 from sb3_ctco.safety import Guard, Safety
-from sb3_ctco.wrappers import RealTimeOptionWrapper, RealTimeWrapper
+from sb3_ctco.wrappers import OptionExecutionWrapper, RealTimeOptionWrapper, RealTimeWrapper
 
 LOW, HIGH = np.array([-1.0, 0.0], np.float32), np.array([1.0, 4.0], np.float32)
 UNLIMITED = {"max_rate": None, "max_slew": None}
@@ -99,6 +99,20 @@ def test_the_safe_action(safe_action, expected, caplog):
 def test_settings_that_are_none(wrong, message):
     with pytest.raises(ValueError, match=message):
         Safety(**wrong)
+
+
+class Interrupt:
+    """Asked every 0.2 s; what it was asked, and whether it ends an option."""
+
+    check_period = 0.2
+    answer = False
+
+    def __init__(self):
+        self.asked = []
+
+    def worth_ending(self, observations, rests):
+        self.asked.append((observations, rests))
+        return np.full(len(rests), self.answer)
 
 
 class Policy:
@@ -297,22 +311,63 @@ def test_an_old_observation_ends_the_option(caplog):
     assert "the safe action was sent 2 times: {'no fresh observation': 2}" in caplog.text
 
 
-# With 0.2 s ahead the first one is a rest that is broken off, and the second one is in vain.
-@pytest.mark.parametrize(("ahead", "n_safe"), [(0.0, 2), (0.2, 1)])
-def test_an_option_that_is_not_finite(ahead, n_safe):
+def limited_machine(wrapper, **kwargs):
+    env = RealTimeWrapper(Machine(), clock=Clock(), safety=Safety(max_rate=2.0, max_slew=None, stale_after=0.3))
+    return wrapper(env, n_rbf=1, d_max=0.3, join="continuous", **kwargs)
+
+
+@pytest.mark.parametrize("wrapper", [OptionExecutionWrapper, RealTimeOptionWrapper])
+def test_options_in_real_time_leave_from_what_was_sent(wrapper):
+    """A rate of 2/s lets through 0.4 in 0.1 s; three steps from −1 to 1 are of 2/3."""
+    env = limited_machine(wrapper, n_sub_options=20, sub_option_tolerance=2.0)
+    obs, _ = env.reset(seed=0)
+    assert obs[-1] == -1.0
+    obs, *_ = env.step([1.0, 1.0])
+    np.testing.assert_allclose(env.unwrapped.commands, [-0.6, -0.2, 0.2], atol=1e-6)
+    np.testing.assert_allclose(obs, [3.0, 0.2], atol=1e-6)
+    np.testing.assert_allclose(env.plan([1.0, 1.0])[:, 0], [0.2 + 0.8 * k / 3 for k in (1, 2, 3)], atol=1e-6)
+    # A sub-option leaves from what was sent, and comes to what was wanted.
+    count, sent = 0, [-1.0, *env.unwrapped.commands]
+    while count < 10:
+        env.reset()
+        sub = env.step([1.0, 1.0])[-1]["sub_options"]
+        for one, after, option in zip(sub.observations, sub.next_observations, sub.options.astype(np.float64), strict=True):
+            first, end = int(one[0]), int(after[0])
+            assert (one[1], after[1]) == pytest.approx((sent[first], sent[end]), abs=1e-6)
+            assert env.option_space.plan(option, one[1:])[-1, 0] == pytest.approx([-1 / 3, 1 / 3, 1.0][end - 1], abs=1e-6)
+            count += 1
+
+
+def test_the_rest_of_an_option_is_told_from_what_was_sent():
+    interrupt = Interrupt()
+    env = limited_machine(RealTimeOptionWrapper, interrupt=interrupt)
+    env.reset()
+    env.step([1.0, 1.0])
+    ((seen, rests),) = interrupt.asked
+    np.testing.assert_allclose(seen, [[2.0, -0.2]], atol=1e-6)
+    np.testing.assert_allclose(rests[0, 0], 1.0, atol=1e-6)
+
+
+@pytest.mark.parametrize("ahead", [0.0, 0.2])
+@pytest.mark.parametrize("join", ["free", "continuous"])
+def test_an_option_that_is_not_finite(ahead, join):
     machine = Machine()
     env = RealTimeWrapper(machine, clock=Clock(), safety=Safety(safe_action="hold", **UNLIMITED))
-    env = RealTimeOptionWrapper(env, ahead, n_rbf=1, d_max=1.0, background=bool(ahead))
+    env = RealTimeOptionWrapper(env, ahead, n_rbf=1, d_max=1.0, join=join, background=bool(ahead))
     env.reset()
     env.step([0.5, 1.0])
     for _ in range(2):
-        *_, info = env.step([np.nan, 1.0])
-    assert info["taken_over"]
+        obs, *_, info = env.step([np.nan, 1.0])
+        assert info["taken_over"]
+        if join == "continuous":
+            assert obs[-1] == 0.5
     *_, info = env.step([0.25, 1.0])
     env.close()
-    assert set(machine.commands) == {0.5, 0.25}
+    assert np.isfinite(machine.commands).all()
+    assert machine.commands[9:12] == [0.5] * 3
+    assert machine.commands[12] == (0.25 if join == "free" else 0.475)
     assert "taken_over" not in info
-    assert env.get_wrapper_attr("total_statistics").safe_ticks == n_safe
+    assert env.get_wrapper_attr("total_statistics").safe_ticks == 2
     unguarded = RealTimeOptionWrapper(RealTimeWrapper(Machine(), clock=Clock(), safety=None), n_rbf=1, d_max=1.0)
     unguarded.reset()
     with pytest.raises(ValueError, match="must be finite"):

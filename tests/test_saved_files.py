@@ -11,6 +11,7 @@ from stable_baselines3.common.save_util import data_to_json, json_to_data
 
 from sb3_ctco import CTCO, FiGARSAC
 from sb3_ctco.option_array import plain
+from sb3_ctco.options import RadialBasis
 from sb3_ctco.torch_layers import SpatialSoftmaxExtractor
 
 DATA = Path(__file__).parent / "data"
@@ -32,7 +33,9 @@ def test_a_model_of_0_1_0_acts_as_it_did_and_learns_on(algorithm):
     assert model.option_space.duration_scale == "linear"
     assert model.replay_buffer.reward_scale == 1.0
     if algorithm is CTCO:
-        assert model.canonical_options is None  # Its critics saw weights as they were.
+        assert not model.canonical_options  # Its critics saw weights as they were.
+        assert model.option_space.trajectory == RadialBasis(model.n_rbf)
+        assert len(model.ent_coefs) == model.n_rbf + 1
     before = model._n_updates
     assert model.learn(60, reset_num_timesteps=False)._n_updates > before
 

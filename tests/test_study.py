@@ -18,12 +18,12 @@ import numpy as np
 import pytest
 import yaml
 from conftest import PATIENCE
-from rliable.metrics import aggregate_iqm
+from rliable.metrics import aggregate_iqm, probability_of_improvement
 
 from sb3_ctco.evaluation import evaluate_discounted_return
 from sb3_ctco.registry import ALGORITHMS as ALGORITHM_ROWS
 from sb3_ctco.registry import TASKS, Task, find_task
-from sb3_ctco.study import agents, engines, plots, runs, schedule, status
+from sb3_ctco.study import agents, engines, plots, runs, schedule, scores, status
 from sb3_ctco.study.cli import main
 from sb3_ctco.study.grid import Run, load_preset, preset_names
 from sb3_ctco.study.records import COLUMNS, collect, paper_returns, read_curves, read_records
@@ -173,7 +173,7 @@ def of_ctco(**changes):
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
-        ({"tasks": ["walker"]}, r"no task 'walker': name one of .*'ball_in_cup'\], or an id of Gymnasium's registry"),
+        ({"tasks": ["walker"]}, r"no task 'walker': name one of .*'visual_reacher_hard'\], or an id of Gymnasium's registry"),
         ({"tasks": ["cheetah", "cheetah"]}, "tasks must be a list of tasks, each once, or a mapping"),
         ({"tasks": {"cheetah": {"rate": 50}}}, r"task cheetah: \[\] missing, \['rate'\] unknown"),
         ({"tasks": {"cheetah": {"evaluations": 0}}}, "task cheetah: evaluations must be a whole number from 1, not 0"),
@@ -629,8 +629,8 @@ def test_the_figure_shows_the_records_and_the_paper():
     for ax, task in zip(figure.axes, ("point_mass", "cheetah", "ball_in_cup"), strict=True):
         lines = {line.get_label(): line for line in ax.get_lines()}
         assert ax.get_xscale() == "log"
-        for algorithm, row in ALGORITHM_ROWS.items():
-            name = row.label
+        for algorithm in ALGORITHMS:
+            name = ALGORITHM_ROWS[algorithm].label
             numbers = paper_returns()[task, algorithm]
             setting = "tuned" if algorithm == "ctco" else "large"
             for label in (f"{name} ({setting})", f"{name}, the paper's figure"):
@@ -664,6 +664,83 @@ def test_interquartile_means_are_those_of_rliable():
 
 
 @pytest.mark.usefixtures("few_resamples")
+def with_repeats():
+    """Synthetic records, and action repeats of which 5 steps are best at 50 Hz, and 25 at 500 Hz."""
+    records = [record for record in synthetic() if record["algorithm"] == "sac"]
+    repeats = []
+    for record in records:
+        rate = round(1 / record["dt"])
+        for steps in (5, 25):
+            value = 2.0 if steps == {50: 5, 500: 25}.get(rate) else 0.1
+            held = {"algorithm": "sac_repeat", "discounted_return": value, "greedy_return": value}
+            repeats.append({**record, **held, "setting": f"{steps}steps", "decision_rate_hz": rate / steps})
+        if rate > 50:
+            repeats.append({**record, "algorithm": "sac_repeat", "setting": "20ms", "discounted_return": 0.3})
+    return [*records, *repeats]
+
+
+def test_sac_stands_for_a_repeat_of_one_step_and_the_best_is_a_line():
+    records = scores.with_equal_repeats(with_repeats())
+    assert plots.lines_of(records) == [("sac", "large"), ("sac_repeat", "20ms"), ("sac_repeat", "best")]
+    lines = plots.by_line(records, "cheetah", "discounted_return")
+    sac = lines["sac", "large"]
+    assert lines["sac_repeat", "best"] == {50: [2.0, 2.0], 100: sac[100], 250: [0.1, 0.1], 500: [2.0, 2.0]}
+    # 20 ms at 50 Hz is a step.
+    assert lines["sac_repeat", "20ms"] == {50: sac[50], 100: [0.3, 0.3], 250: [0.3, 0.3], 500: [0.3, 0.3]}
+    assert scores.with_equal_repeats(synthetic()) == synthetic()
+
+
+def scored(**returns):
+    """Records of two tasks at two rates: a list of seeds for each algorithm, task and rate, as in ``sac_cheetah_50``."""
+    records = []
+    for name, values in returns.items():
+        algorithm, task, rate = name.split("_")
+        for seed, value in enumerate(values):
+            record = {"algorithm": algorithm, "setting": "a", "task": task, "dt": 1 / int(rate), "seed": seed}
+            records.append({**record, "discounted_return": value})
+    return records
+
+
+def test_scores_by_hand(few_resamples):
+    """The best of cheetah is 2 (CTCO at 500 Hz), of Pendulum-v1 4 (SAC at 50 Hz)."""
+    name = "Pendulum-v1"
+    records = scored(
+        **{"ctco_cheetah_50": [1, 1], "ctco_cheetah_500": [1, 3], f"ctco_{name}_50": [2, 2], f"ctco_{name}_500": [2, 2]},
+        **{"sac_cheetah_50": [1, 2], "sac_cheetah_500": [0, 0], f"sac_{name}_50": [4, 4], f"sac_{name}_500": [0, 3]},
+    )
+    relative = scores.relative_scores(records, "discounted_return")
+    assert relative["ctco", "a"][500].tolist() == [[0.5, 0.5], [1.5, 0.5]]
+    assert relative["sac", "a"][50].tolist() == [[0.5, 1.0], [1.0, 1.0]]
+    averaged = scores.frequency_averaged(relative)
+    # Means over rates: CTCO 0.5 and 1.0 on cheetah, 0.5 twice; SAC 0.25 and 0.5, 0.5 and 0.875. Middle halves: 0.5; 0.5.
+    assert averaged["ctco", "a"][0] == pytest.approx(0.5)
+    assert averaged["sac", "a"][0] == pytest.approx(0.5)
+    # At 50 Hz CTCO's seeds are ahead of SAC's never, and level in half of cheetah's pairs: (½·½ + 0)/2.
+    better = scores.improvement(relative, ("ctco", "a"))
+    assert list(better) == [("sac", "a")]
+    assert better["sac", "a"][50][0] == pytest.approx(0.125)
+    assert better["sac", "a"][500][0] == pytest.approx((1.0 + 0.5) / 2)
+    assert better["sac", "a"][500][0] == pytest.approx(
+        probability_of_improvement(relative["ctco", "a"][500], relative["sac", "a"][500])
+    )
+    _, low, high = better["sac", "a"][50]
+    assert low <= 0.125 <= high
+    assert "| CTCO | a | 0.50 [" in scores.averaged_table(relative)
+    # A rate that a line lacks leaves it out of the average over rates, and in at the others.
+    without = scores.relative_scores([r for r in records if (r["algorithm"], r["dt"]) != ("sac", 0.02)], "discounted_return")
+    assert list(scores.frequency_averaged(without)) == [("ctco", "a")]
+    assert list(scores.improvement(without, ("ctco", "a"))["sac", "a"]) == [500]
+
+
+def test_the_pareto_figure_joins_the_settings_of_an_algorithm():
+    figure = scores.draw_pareto(with_repeats(), "discounted_return")
+    assert len(figure.axes) == 4 * 3
+    ax = next(ax for ax in figure.axes if ax.get_title() == "cheetah run, 500 Hz")
+    points = {container.get_label(): container.lines[0].get_xydata().tolist() for container in ax.containers}
+    assert points["SAC, action repeat"][0] == [20.0, 2.0]
+    assert [x for x, _ in points["SAC, action repeat"]] == sorted(x for x, _ in points["SAC, action repeat"])
+
+
 def test_the_table_stands_beside_the_papers_numbers():
     estimates = {"discounted_return": plots.interquartile_means(synthetic(), "discounted_return")}
     lines = plots.table(synthetic(), estimates).splitlines()
@@ -683,12 +760,29 @@ def test_plot_of_a_csv_file_and_of_a_folder(finished, tmp_path, capsys):
     file = write_csv(tmp_path / "quick.csv", synthetic())
     assert main(["plot", str(file), "--output", str(tmp_path / "figures")]) == 0
     names = {path.name for path in (tmp_path / "figures").iterdir()}
-    drawn = ("frequency", "frequency_greedy", "decision_rates", "interquartile_means")
+    drawn = (
+        *("frequency", "frequency_greedy", "decision_rates", "interquartile_means"),
+        *("pareto", "profiles", "improvement"),
+    )
     assert names == {f"{name}.{ending}" for name in drawn for ending in ("png", "svg")} | {"table.md"}
     for name in drawn:
         picture = mpl.image.imread(tmp_path / "figures" / f"{name}.png")
         assert picture[..., :3].std() > 0.05  # not blank
     assert "FiGAR-SAC (large)" in (tmp_path / "figures" / "frequency.svg").read_text()
+    assert "## Averaged over rates" in (tmp_path / "figures" / "table.md").read_text()
+
+
+def test_plot_of_several_files_and_of_some_lines(tmp_path, capsys, few_resamples):
+    records = with_repeats()
+    kinds = ("sac", "sac_repeat")
+    files = [write_csv(tmp_path / f"{kind}.csv", [one for one in records if one["algorithm"] == kind]) for kind in kinds]
+    command = ["plot", *map(str, files), "--output", str(tmp_path / "figures"), "--settings"]
+    assert main([*command, "large", "best"]) == 0
+    text = (tmp_path / "figures" / "frequency.svg").read_text()
+    assert "SAC, action repeat (best)" in text
+    assert "20ms" not in text
+    assert main([*command, "worst"]) == 1
+    assert "no record has an algorithm of None and a setting of ['worst']" in capsys.readouterr().err
 
 
 @pytest.mark.slow

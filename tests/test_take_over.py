@@ -11,10 +11,10 @@ def between(first, last):
     return lambda obs: np.array([-0.5]) if first <= obs[0] < last else None
 
 
-def make_env(scripted_env, take_over, **kwargs):
+def make_env(scripted_env, take_over, join="free", **kwargs):
     recorded = []
     inner = TakeOverWrapper(scripted_env(rewards=lambda step, action: float(step), **kwargs), take_over, recorded.append)
-    env = RealTimeOptionWrapper(inner, n_rbf=1, d_max=1.0)
+    env = RealTimeOptionWrapper(inner, n_rbf=1, d_max=1.0, join=join)
     env.reset(seed=0)
     return env, recorded
 
@@ -78,3 +78,13 @@ def test_deciding_ahead(scripted_env):
         options.append((info["option"]["n_steps"], "taken_over" in info))
     assert options == [(8, False), (1, False), (6, True)]
     assert len(recorded[0].actions) == 6
+
+
+def test_with_a_continuous_join_control_comes_back_where_it_was_given(scripted_env):
+    env, _ = make_env(scripted_env, between(4, 8), join="continuous")
+    for last_action in (0.1, -0.5):
+        obs, *_, info = env.step([0.25, 1.0])
+        assert obs[-1] == pytest.approx(last_action)
+        assert info["option"]["n_steps"] == 4
+    # A tenth of the way from −0.5 to 0.25 with each step
+    np.testing.assert_allclose(env.plan([0.25, 1.0])[:2, 0], [-0.425, -0.35], atol=1e-6)

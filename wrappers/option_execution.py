@@ -25,6 +25,7 @@ from sb3_ctco.options import (
     OptionSpace,
     RewardUnit,
     Trajectory,
+    default_durations,
     draw_stretches,
     integrated_reward,
     rows_of,
@@ -38,7 +39,8 @@ from sb3_ctco.wrappers.checks import check_observation, is_finite, reset_env
 from sb3_ctco.wrappers.step_sequence import SequenceResult, StepSequence, find_step_sequence
 from sb3_ctco.wrappers.timing import find_dt
 
-#: Where the loop over ``step`` leaves what it observed on the way, so that an environment's own infos stay
+#: Where the loop over ``step`` leaves what it observed on the way, and the actions sent just before, so that an environment's
+#: own infos stay
 ON_THE_WAY = "_observations_on_the_way"
 
 
@@ -70,8 +72,10 @@ class OptionExecutionWrapper(gym.Wrapper, RecordConstructorArgs):
 
     :param env: the environment to wrap; its action space must be a ``Box`` with finite bounds, of any shape
     :param n_rbf: number of radial basis functions an action dimension; 1 repeats one action
-    :param d_max: longest duration, in s
-    :param d_min: shortest duration, in s; one step (``dt``) by default
+    :param d_max: longest duration, in s; by default a fifth of the horizon 1/τ, 0.5 s at most, see
+        :func:`~sb3_ctco.options.default_durations`
+    :param d_min: shortest duration, in s, and never less than one step (``dt``), which 0 stands for; by default a hundredth of
+        the horizon
     :param dt: the interaction period, in s; by default what :func:`find_dt` finds
     :param discount_rate: τ, in 1/s; by default the paper's 0.404 (a factor of 0.98 over 0.05 s)
     :param reward: what ``step`` returns as reward: ``"sum"`` of the primitive rewards, which makes returns comparable
@@ -85,7 +89,8 @@ class OptionExecutionWrapper(gym.Wrapper, RecordConstructorArgs):
     :param duration_scale: ``"log"`` or ``"linear"``, see :class:`~sb3_ctco.options.OptionSpace`
     :param join: ``"free"``, or ``"continuous"``: an option leaves from the action that is being sent when it begins. That
         action, normalised, is then part of the observation (:mod:`sb3_ctco.options.joins`); an episode begins with the middle
-        of the box, or with ``info["last_action"]`` of the environment's ``reset``, in its own units
+        of the box. Where the environment's info has a ``"last_action"``, after ``reset`` or after a step in which something
+        else was sent than it was given, that is taken, in the environment's units
     :raises TypeError: if the action space is not a ``Box``
     :raises ValueError: if its bounds are not finite, a setting is out of range, or dt is not given and not found
     """
@@ -96,7 +101,7 @@ class OptionExecutionWrapper(gym.Wrapper, RecordConstructorArgs):
         self,
         env: gym.Env,
         n_rbf: int = 3,
-        d_max: float = 0.5,
+        d_max: float | None = None,
         d_min: float | None = None,
         dt: float | None = None,
         discount_rate: float = DEFAULT_DISCOUNT_RATE,
@@ -143,9 +148,9 @@ class OptionExecutionWrapper(gym.Wrapper, RecordConstructorArgs):
             raise ValueError(f"sub_option_tolerance must be at least 0, not {sub_option_tolerance}")
         dt = find_dt(env, required_by="OptionExecutionWrapper") if dt is None else dt
         #: The settings that a policy for this environment must share.
-        self.option_space = OptionSpace.make(
-            n_rbf, d_max, dt if d_min is None else d_min, dt, discount_rate, trajectory, duration_scale, join
-        )
+        shortest, longest = default_durations(discount_rate)
+        d_min, d_max = shortest if d_min is None else d_min, longest if d_max is None else d_max
+        self.option_space = OptionSpace.make(n_rbf, d_max, max(d_min, dt), dt, discount_rate, trajectory, duration_scale, join)
         self.reward: Literal["sum", "integral"] = reward
         self.reward_unit: RewardUnit = reward_unit
 
@@ -225,22 +230,27 @@ class OptionExecutionWrapper(gym.Wrapper, RecordConstructorArgs):
         before = self._last_action
         trajectory = space.plan(option.clip(-1.0, 1.0), before)
         n_steps = len(trajectory)
-        stretches = draw_stretches(self._stretch_rng, self.n_sub_options, n_steps, shortest_steps(space))
+        stretches = self._draw_stretches(n_steps)
         observe = sorted({k for ends in stretches for k in ends} - {0, n_steps})
         actions = self._box.actions(trajectory)
         obs, rewards, terminated, truncated, info = self._checked(play, actions, observe)
-        observations = info.pop(ON_THE_WAY if ON_THE_WAY in info else "observations", []) if observe else []
+        on_the_way: list[tuple[Any, Any]] = []
+        if observe and ON_THE_WAY in info:
+            on_the_way = info.pop(ON_THE_WAY)
+        elif observe:
+            on_the_way = list(zip(info.pop("observations", []), (actions[k - 1] for k in observe), strict=False))
         # Stacked, they are copies, too: the environment may overwrite its own.
-        seen = stack([self._last_obs, *observations, obs]) if self.n_sub_options else None
-        if len(observations) and not is_finite(seen):
+        seen = stack([self._last_obs, *(one for one, _ in on_the_way), obs]) if self.n_sub_options else None
+        if on_the_way and not is_finite(seen):
             raise ValueError(f"the environment {self.env} returned an observation that is not finite: {seen}")
         if not (terminated or truncated):
             self._play = play
 
         n_ran = len(rewards)
-        last_action = self._keep_played(actions[:n_ran])
+        last_action = self._keep_played(actions[:n_ran], info)
         if before is not None:
-            self._last_action = self._box.normalise([last_action])[0]
+            sent = self._box.normalise([*(action for _, action in on_the_way), last_action]).clip(-1.0, 1.0)
+            self._last_action = sent[-1]
             obs = with_last_action(self.observation_space, obs, self._last_action)
         integral = integrated_reward(rewards, space.dt, space.discount_rate, self.reward_unit)
         info["option"] = OptionInfo(
@@ -250,11 +260,11 @@ class OptionExecutionWrapper(gym.Wrapper, RecordConstructorArgs):
             discount=math.exp(-space.discount_rate * n_ran * space.dt),
         )
         if seen is not None:
-            steps = [0, *observe[: len(observations)], n_ran]
+            steps = [0, *observe[: len(on_the_way)], n_ran]
             self._last_obs = rows_of(seen, -1)
             if before is not None:
-                last_actions = np.vstack([before, self._box.normalise(actions[np.minimum(steps[1:], n_steps) - 1])])
-                seen = with_last_action(self.observation_space, seen, last_actions)
+                before = np.vstack([before, sent])
+                seen = with_last_action(self.observation_space, seen, before)
             played, ended = (trajectory, rewards, stretches, steps, seen), (terminated, truncated)
             info["sub_options"] = sub_options(space, *played, *ended, self.reward_unit, self.sub_option_tolerance, before)
         return obs, float(rewards.sum()) if self.reward == "sum" else integral, terminated, truncated, info
@@ -270,10 +280,13 @@ class OptionExecutionWrapper(gym.Wrapper, RecordConstructorArgs):
             self.n_sub_options = n_sub_options
             self._play = None
 
-    def _keep_played(self, actions: np.ndarray) -> np.ndarray:
+    def _draw_stretches(self, n_steps: int) -> list[tuple[int, int]]:
+        return draw_stretches(self._stretch_rng, self.n_sub_options, n_steps, shortest_steps(self.option_space))
+
+    def _keep_played(self, actions: np.ndarray, info: dict[str, Any]) -> np.ndarray:
         """Keep the actions that were played, and tell the one that the next option leaves from."""
         self.played = actions
-        return actions[-1]
+        return np.asarray(info.get(LAST_ACTION, actions[-1]))
 
     def plan(self, option: npt.ArrayLike) -> np.ndarray:
         """All primitive actions of an option that begins now, in the inner environment's units.
@@ -312,7 +325,7 @@ class OptionExecutionWrapper(gym.Wrapper, RecordConstructorArgs):
 
     def _step_in_a_loop(self, actions: np.ndarray, observe: Sequence[int] = ()) -> SequenceResult:
         rewards: list[float] = []
-        observations = []
+        on_the_way = []
         step = self.env.step
         # In stretches between the observations that are wanted, so that a step costs nothing more.
         for first, last in itertools.pairwise((0, *observe, len(actions))):
@@ -324,7 +337,7 @@ class OptionExecutionWrapper(gym.Wrapper, RecordConstructorArgs):
             if terminated or truncated:
                 break
             if last < len(actions):
-                observations.append(deepcopy(obs))
+                on_the_way.append(deepcopy((obs, info.get(LAST_ACTION, action))))
         if observe:
-            info[ON_THE_WAY] = observations
+            info[ON_THE_WAY] = on_the_way
         return obs, rewards, terminated, truncated, info

@@ -9,9 +9,10 @@ from typing import Any, Literal, Protocol, SupportsFloat, runtime_checkable
 import gymnasium as gym
 from gymnasium.utils import RecordConstructorArgs
 
+from sb3_ctco.options import LAST_ACTION
 from sb3_ctco.safety import Guard, Safety
 from sb3_ctco.wrappers.checks import reset_env
-from sb3_ctco.wrappers.take_over import SENT_ACTION, TAKEN_OVER
+from sb3_ctco.wrappers.take_over import TAKEN_OVER
 from sb3_ctco.wrappers.timing import find_dt
 
 logger = logging.getLogger(__name__)
@@ -93,8 +94,8 @@ class RealTimeWrapper(gym.Wrapper, RecordConstructorArgs):
     Commands to a machine are guarded (:class:`~sb3_ctco.safety.Safety`): their changes are limited, and the safe action takes
     the place of one that is not finite, or that was decided on without a fresh observation. ``receive`` tells the age of
     its observation, in s, as ``info["observation_age"]``, if it may be old, and ``reset`` may tell the action that is being
-    sent as ``info["last_action"]``. A step with the safe action has ``info["interrupted"]`` and ``info["taken_over"]``, so
-    that it ends an option, and is no transition of the policy.
+    sent as ``info["last_action"]``, as each guarded step does. A step with the safe action has ``info["interrupted"]`` and
+    ``info["taken_over"]``, so that it ends an option, and is no transition of the policy.
 
     :param env: the environment
     :param dt: the period, in s; by default what :func:`~sb3_ctco.wrappers.find_dt` finds
@@ -146,7 +147,7 @@ class RealTimeWrapper(gym.Wrapper, RecordConstructorArgs):
         obs, info = reset_env(self.env, seed, options)
         self._observation_age, self._sent_at = 0.0, None
         if self.guard is not None:
-            self.guard.start(info.get("last_action"))
+            self.guard.start(info.get(LAST_ACTION))
         return obs, info
 
     def step(self, action: Any) -> tuple[Any, SupportsFloat, bool, bool, dict[str, Any]]:
@@ -180,7 +181,7 @@ class RealTimeWrapper(gym.Wrapper, RecordConstructorArgs):
         self._observation_age = info.get("observation_age", 0.0)
         info = {**info, "real_time": {"lateness": lateness}}
         if self.guard is not None:
-            info[SENT_ACTION] = action
+            info = {LAST_ACTION: action, **info}
         if replaced:
             info |= {"interrupted": True, TAKEN_OVER: True}
         return obs, reward, terminated, truncated, info

@@ -13,11 +13,11 @@ from gymnasium.utils import RecordConstructorArgs
 from stable_baselines3.common.env_util import unwrap_wrapper
 
 from sb3_ctco.option_array import plain
-from sb3_ctco.options import PLAYED, ValueInterrupt, shortest_steps, stack, with_last_action
+from sb3_ctco.options import LAST_ACTION, PLAYED, ValueInterrupt, shortest_steps, stack, with_last_action
 from sb3_ctco.wrappers.option_execution import ON_THE_WAY, OptionExecutionWrapper
 from sb3_ctco.wrappers.real_time import RealTimeWrapper
 from sb3_ctco.wrappers.step_sequence import SequenceResult, StepSequence
-from sb3_ctco.wrappers.take_over import SENT_ACTION
+from sb3_ctco.wrappers.take_over import TAKEN_OVER
 
 #: ``interrupt(observation of the last decision, observation, seconds since that one)``: whether to end the option
 Interrupt = Callable[[Any, Any, float], bool]
@@ -33,13 +33,13 @@ class RealTimeOptionWrapper(OptionExecutionWrapper):
     nothing is counted twice or late; but the state at a decision does not tell which rest is still to play. The policy
     sees the state of ``decide_ahead`` seconds before its option begins, and the process is a semi-Markov process only
     as far as that does not matter. The first option of an episode begins at once. With a continuous join an option leaves from
-    the end of that rest, and the observation holds the action there.
+    the end of that rest, and the observation holds the action there: what is commanded, since a guard has not limited it yet.
 
     With ``interrupt``, a function that is called after each primitive step, an option ends as soon as it says so; or as soon
     as a :class:`~sb3_ctco.options.ValueInterrupt` does, which is asked every ``check_period`` and told the rest of the plan.
     The transition has the time that ran, and ``info["played"]`` is the option that plays what was played, as which CTCO stores
     it (not with ``decide_ahead``, where a transition consists of parts of two options). ``info["interrupted"]`` of the
-    environment inside ends an option as well.
+    environment inside ends it as well.
 
     An option that is not finite, of a policy that has diverged, is no error where commands are guarded
     (:class:`~sb3_ctco.wrappers.RealTimeWrapper`): the safe action is sent, and the next decision follows.
@@ -134,15 +134,16 @@ class RealTimeOptionWrapper(OptionExecutionWrapper):
 
     def step(self, action: npt.ArrayLike) -> tuple[Any, SupportsFloat, bool, bool, dict[str, Any]]:
         """Play one option, or what is due of it and of the one before."""
-        before = self._last_action
         option = np.asarray(plain(action), dtype=np.float64)
         self._is_lost = self._is_guarded and not np.isfinite(option).all()
-        # In the place of a lost one the shortest, whose actions the guard replaces.
+        before = self._last_action
+        # In place of one that is lost the shortest one, whose actions the guard replaces.
         result = super().step(np.full_like(option, -1.0) if self._is_lost else option)
         info = result[4]
-        if info.get("interrupted", False) and not self._ahead_steps:
-            played = self._box.normalise(self.played)
-            option, residual = self.option_space.stretch(played, 0, len(played), before)
+        if self._is_lost:
+            info[TAKEN_OVER] = True
+        elif info.get("interrupted", False) and not self._ahead_steps:
+            option, residual = self.option_space.closest(self._box.normalise(self.played), before)
             if residual <= self.sub_option_tolerance:
                 info[PLAYED] = option
         return result
@@ -166,16 +167,21 @@ class RealTimeOptionWrapper(OptionExecutionWrapper):
             self._executor.shutdown()
         super().close()
 
-    def _keep_played(self, actions: np.ndarray) -> np.ndarray:
-        last = super()._keep_played(self._played)
+    def _draw_stretches(self, n_steps: int) -> list[tuple[int, int]]:
+        # An option that begins at once, or after another time, tells nothing of options that are decided on so much ahead.
+        n_rest = 0 if self._rest is None else len(self._rest)
+        return super()._draw_stretches(n_steps) if n_rest == self._ahead_steps <= n_steps else []
+
+    def _keep_played(self, actions: np.ndarray, info: dict[str, Any]) -> np.ndarray:
+        last = super()._keep_played(self._played, info)
         return last if self._rest is None else self._rest[-1]
 
     def _play_around_decisions(self, plan: np.ndarray, observe: Sequence[int] = ()) -> SequenceResult:
         rest = self._finish_rest()
         if self._is_lost:
-            plan = np.full_like(plan, np.nan)
-        # Something must happen between two decisions.
-        n_now = max(len(plan) - self._ahead_steps, 0 if rest is not None else 1)
+            plan = np.full_like(plan[:1], np.nan)
+        # Something must happen between two decisions, and what is lost is not for later.
+        n_now = max(len(plan) - self._ahead_steps, 1 if rest is None or self._is_lost else 0)
         over = rest is not None and (rest[2] or rest[3] or rest[4].get("interrupted", False))
         if rest is not None and (over or n_now == 0):
             result = rest
@@ -186,12 +192,13 @@ class RealTimeOptionWrapper(OptionExecutionWrapper):
                 result = (result[0], [*rest[1], *result[1]], *result[2:])  # type: ignore[misc]
             over = result[2] or result[3] or result[4].get("interrupted", False)
         self._decided_on = result[0]
+        self._played, self._commands = np.array(self._commands), []
         # A sub-option that was decided on after k steps of this time would play as this option does from its step k on.
         on_the_way = result[4].pop(ON_THE_WAY)
         if observe:
-            n_ran = len(result[1])  # type: ignore[arg-type]
-            result[4][ON_THE_WAY] = [on_the_way[k - 1] for k in observe if k < n_ran]
-        self._played, self._commands = np.array(self._commands), []
+            seen = [(k, *on_the_way[k - 1]) for k in observe if k < len(result[1])]
+            # With decide_ahead it would leave from an action that was still to be sent then.
+            result[4][ON_THE_WAY] = [(obs, plan[k - 1] if self._ahead_steps else sent) for k, obs, sent in seen]
         if not over and n_now < len(plan):
             self._rest = plan[n_now:]
             if self._executor is not None:
@@ -207,32 +214,34 @@ class RealTimeOptionWrapper(OptionExecutionWrapper):
 
     def _play_until_interrupted(self, actions: np.ndarray, steps_before: int = 0) -> SequenceResult:
         rewards: list[Any] = []
-        observations: list[Any] = []
+        on_the_way: list[tuple[Any, Any]] = []
         for action in actions:
             if self._abandoned:
                 raise ResetNeeded("playing was abandoned: call reset() first")
+            self._commands.append(action)
             obs, reward, terminated, truncated, info = self.env.step(action)
-            self._commands.append(info.get(SENT_ACTION, action))
             rewards.append(reward)
+            sent = info.get(LAST_ACTION, action)
             if self.n_sub_options:
                 # All of them, because those of a rest are chosen after it.
-                observations.append(deepcopy(obs))
-            if terminated or truncated or info.get("interrupted", False):
+                on_the_way.append(deepcopy((obs, sent)))
+            if terminated or truncated or info.get("interrupted"):
                 break
-            if self._interrupt is not None and self._is_interrupted(obs, actions, len(rewards), steps_before):
+            if self._interrupt is not None and self._is_interrupted(obs, sent, actions, len(rewards), steps_before):
                 info = {**info, "interrupted": True}
                 break
-        return obs, rewards, terminated, truncated, {**info, ON_THE_WAY: observations}
+        return obs, rewards, terminated, truncated, {**info, ON_THE_WAY: on_the_way}
 
-    def _is_interrupted(self, obs: Any, actions: np.ndarray, n_ran: int, steps_before: int) -> bool:
+    def _is_interrupted(self, obs: Any, sent: Any, actions: np.ndarray, n_ran: int, steps_before: int) -> bool:
         if self._check_steps is None:
             assert callable(self._interrupt)
             return self._interrupt(self._decided_on, obs, (steps_before + n_ran) * self.option_space.dt)
         if n_ran % self._check_steps or len(actions) - n_ran < shortest_steps(self.option_space):
             return False
         assert isinstance(self._interrupt, ValueInterrupt)
-        plan = self._box.normalise(actions)
-        rest, _ = self.option_space.stretch(plan, n_ran, len(plan), self._last_action)
+        before = None
         if self.option_space.joined:
-            obs = with_last_action(self.observation_space, obs, plan[n_ran - 1])
+            before = self._box.normalise([sent])[0].clip(-1.0, 1.0)
+            obs = with_last_action(self.observation_space, obs, before)
+        rest, _ = self.option_space.closest(self._box.normalise(actions[n_ran:]), before)
         return bool(self._interrupt.worth_ending(stack([obs]), rest[None])[0])

@@ -9,7 +9,7 @@ import numpy as np
 from gymnasium.utils import RecordConstructorArgs
 
 from sb3_ctco.datasets import RecordedTrajectory
-from sb3_ctco.options import stack
+from sb3_ctco.options import LAST_ACTION, stack
 from sb3_ctco.wrappers.checks import reset_env
 from sb3_ctco.wrappers.timing import find_dt
 
@@ -17,8 +17,6 @@ from sb3_ctco.wrappers.timing import find_dt
 TakeOver = Callable[[Any], Any]
 #: Key of the infos of steps in which another action was sent than the policy's
 TAKEN_OVER = "taken_over"
-#: Key under which an info tells the action that was sent, where that is not the one that was given
-SENT_ACTION = "sent_action"
 
 
 class TakeOverWrapper(gym.Wrapper, RecordConstructorArgs):
@@ -64,9 +62,10 @@ class TakeOverWrapper(gym.Wrapper, RecordConstructorArgs):
             self._observations = self._observations or [self._last_obs]
             self._observations.append(deepcopy(obs))
             # A guard inside may have sent another one.
-            self._actions.append(info.get(SENT_ACTION, other))
+            self._actions.append(info.get(LAST_ACTION, other))
             self._rewards.append(float(reward))
-            info = {SENT_ACTION: other, **info, TAKEN_OVER: True}
+            # Whatever is inside, such as a guard, knows better what was sent.
+            info = {LAST_ACTION: other, **info, TAKEN_OVER: True}
         self._ask(obs)
         if self._next_action is None or terminated or truncated:
             self.hand_over(terminated, truncated)

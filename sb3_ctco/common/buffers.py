@@ -24,7 +24,6 @@ from sb3_ctco.options import (
     shortest_steps,
     sub_options,
     with_last_action,
-    without_last_action_space,
 )
 from sb3_ctco.vec_env import PENDING
 
@@ -183,8 +182,8 @@ class _OptionStorage(ReplayBuffer):
 
         Options are in seconds, so the trajectory may have been recorded at another rate than the environment's. A stretch
         is of whole recorded steps: where these are longer than d_min, no option is shorter than one of them. With a continuous
-        join observations are the environment's, without the last action, and the first step only tells what the others leave
-        from.
+        join a stretch leaves from the action before it, which is put into the observations here; the first leaves from the
+        middle of the box.
 
         :param observations: ``[n + 1, *observation_shape]``, in the end the one after the last action; or a dictionary of such
         :param actions: in the units of the environment, ``[n, *action_shape]``
@@ -220,17 +219,13 @@ class _OptionStorage(ReplayBuffer):
             )
         rewards = np.asarray(rewards, dtype=np.float64)
         plan = ActionBox(self.primitive_action_space.low, self.primitive_action_space.high).normalise(actions)
-        observation_space = self.observation_space
+        sent = None
         if space.joined:
-            observation_space = without_last_action_space(observation_space, plan.shape[1])
-        seen = _recorded(observations, observation_space)
+            # As an episode begins: with the middle of the box
+            sent = np.vstack([np.zeros((1, plan.shape[1])), plan])
+            observations = with_last_action(self.observation_space, observations, _as_many(sent, observations))
+        seen = _recorded(observations, self.observation_space)
         _check_recorded(seen, plan, rewards)
-        before = None
-        if space.joined:
-            # Nobody knows the action before the first one, so that options begin with the second.
-            before = plan
-            plan, rewards, seen = plan[1:], rewards[1:], rows_of(seen, slice(1, None))
-            seen = with_last_action(self.observation_space, seen, before)
 
         n_steps = len(rewards)
         firsts = np.arange(n_steps).repeat(n_stretches)
@@ -245,8 +240,8 @@ class _OptionStorage(ReplayBuffer):
             window, rows = slice(first, end), slice(first, end + 1)
             played = (plan[window], rewards[window], stretches, list(range(end - first + 1)), rows_of(seen, rows))
             ended = (terminated and end == n_steps, truncated and end == n_steps)
-            leaves_from = None if before is None else before[first]
-            parts.append(sub_options(space, *played, *ended, reward_unit, tolerance, leaves_from))
+            before = None if sent is None else sent[rows]
+            parts.append(sub_options(space, *played, *ended, reward_unit, tolerance, before))
         added = sum(map(len, parts))
         if self.n_demonstrations + added >= self.buffer_size:
             raise ValueError(
@@ -258,7 +253,7 @@ class _OptionStorage(ReplayBuffer):
             row = self.buffer_size - self.n_demonstrations
             self._write(slice(row, row + len(part)), part)
         self._move_to(self.pos)
-        residuals = np.concatenate([np.empty(0), *(part.residuals for part in parts)])
+        residuals = np.concatenate([part.residuals for part in parts])
         return AddedTrajectory(added, len(firsts) - added, float(residuals.max(initial=0.0)))
 
     def size(self) -> int:
@@ -403,6 +398,12 @@ def _recorded(observations: Any, space: spaces.Space) -> Stacked:
     if not np.isfinite(stacked).all():
         raise ValueError("observations must be finite, and these are not: leave out the steps where a sensor failed")
     return stacked
+
+
+def _as_many(rows: np.ndarray, observations: Any) -> np.ndarray:
+    """As many rows as there are observations, which are checked later."""
+    count = len(next(iter(observations.values())) if isinstance(observations, dict) else observations)
+    return np.resize(rows, (count, rows.shape[1]))
 
 
 def _check_recorded(seen: Stacked, plan: np.ndarray, rewards: np.ndarray) -> None:

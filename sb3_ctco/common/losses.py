@@ -52,25 +52,26 @@ def actor_loss(q_values: th.Tensor, entropy_costs: th.Tensor) -> th.Tensor:
     return (entropy_costs - q_values.amin(dim=0)).mean()
 
 
-def log_reference_density(
-    omega_dim: int, d_min: float, d_max: float, reference: EntropyReference, log_prob: th.Tensor
-) -> th.Tensor:
+def log_reference_density(sizes: th.Tensor, d_min: float, d_max: float, reference: EntropyReference) -> th.Tensor | None:
     """Log-density of what entropy is counted relative to, over the normalised option box.
 
     ``"uniform"`` is the uniform distribution over all options: log π − log u is never negative on average, so
     a decision is never paid for its entropy, and a policy of little entropy pays for each decision.
-    ``"average"`` is what the policy has on average over a batch: zero on average, so that β_h is all that a decision costs.
+    ``"average"`` is what the policy has on average over a batch, whatever that is, hence None: zero on average, so that β_h is
+    all that a decision costs.
     ``"paper"`` is the unit density over (ω, d in s): log π as it stands.
 
-    :param log_prob: log π(ω|s) and log π(d|s) of a batch, ``[batch, 2]``
-    :return: for ω and d, shape ``[2]``
+    :param sizes: how many entries of an option each density is of, the duration being the last, ``[n + 1]``
+    :return: likewise
     """
-    if reference == "uniform":
-        return th.tensor([-omega_dim * math.log(2.0), -math.log(2.0)])
     if reference == "average":
-        return log_prob.mean(dim=0)
+        return None
+    if reference == "uniform":
+        return -sizes * math.log(2.0)
+    density = th.zeros_like(sizes)
     # A duration in s has (d_max − d_min)/2 of the length of the box [−1, 1].
-    return th.tensor([0.0, math.log((d_max - d_min) / 2.0) if d_max > d_min else 0.0])
+    density[-1] = math.log((d_max - d_min) / 2.0) if d_max > d_min else 0.0
+    return density
 
 
 def repetition_values(q_values: th.Tensor, repetition_log_probs: th.Tensor, duration_ent_coef: th.Tensor) -> th.Tensor:

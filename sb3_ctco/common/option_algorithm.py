@@ -63,7 +63,8 @@ class OptionOffPolicyAlgorithm(OffPolicyAlgorithm):
 
     :param n_rbf: number of radial basis functions an action dimension
     :param d_max: longest duration of an option, in s
-    :param d_min: shortest duration, in s; by default one step of the environment
+    :param d_min: shortest duration, in s, and never less than one step of the environment; by default what
+        ``OptionExecutionWrapper`` has
     :param dt: the environment's interaction period, in s; by default found in the environment
     :param trajectory: how ω becomes actions, a name in ``sb3_ctco.options.TRAJECTORIES`` or a class
     :param duration_scale: ``"log"`` or ``"linear"``, see :class:`~sb3_ctco.options.OptionSpace`
@@ -90,7 +91,7 @@ class OptionOffPolicyAlgorithm(OffPolicyAlgorithm):
         "duration_scale",
         "join",
         "reward_scale",
-        "canonical_weights",
+        "canonical_options",
         "n_repetitions",
         "ent_coef",
         "duration_ent_coef",
@@ -100,7 +101,12 @@ class OptionOffPolicyAlgorithm(OffPolicyAlgorithm):
     _own_setting: ClassVar[str] = "discount_rate"
 
     #: Of arguments that older files do not have: what their networks were trained with
-    _before_it_was_saved: ClassVar[dict[str, Any]] = {"duration_scale": "linear", "join": "free", "reward_scale": 1.0}
+    _before_it_was_saved: ClassVar[dict[str, Any]] = {
+        "trajectory": "rbf",
+        "duration_scale": "linear",
+        "join": "free",
+        "reward_scale": 1.0,
+    }
 
     def __init__(
         self,
@@ -182,7 +188,7 @@ class OptionOffPolicyAlgorithm(OffPolicyAlgorithm):
                 f"dt={self.dt} s and d_min={self.d_min} s are found in an environment, and {type(self).__name__} has not "
                 "had one: pass it env, or dt and d_min"
             )
-        return OptionSpace.make(**{**self._option_arguments, "dt": self.dt, "d_min": self.d_min})
+        return OptionSpace.make(**{**self._option_arguments, "dt": self.dt, "d_min": max(self.d_min, self.dt)})
 
     @property
     def _option_arguments(self) -> dict[str, Any]:
@@ -278,6 +284,8 @@ class OptionOffPolicyAlgorithm(OffPolicyAlgorithm):
         """The options' settings of an environment, once options mean the same in it as to the algorithm."""
         settings: list[OptionSpace] = env.get_attr("option_space")
         known = {name: value for name, value in self._option_arguments.items() if value is not None}
+        if self.d_min is not None:
+            known["d_min"] = max(self.d_min, settings[0].dt)  # as the wrapper has it
         expected = OptionSpace.make(**{**settings[0].arguments, **known})
         for one in settings:
             for name, (value, found) in expected.differences(one).items():
@@ -335,12 +343,16 @@ class OptionOffPolicyAlgorithm(OffPolicyAlgorithm):
         if env is not None:
             kwargs["n_envs"] = env.num_envs if isinstance(env, VecEnv) else 1
         model = super().load(path, None, device, custom_objects, print_system_info, force_reset, **kwargs)
+        model._after_load()
         if env is not None:
             # Only now are the settings known that a bare environment is wrapped with.
             model.set_env(env, force_reset)
             if model.seed is not None:
                 model.env.seed(model.seed)  # type: ignore[union-attr]
         return model
+
+    def _after_load(self) -> None:
+        """What is left to do when a file has been read; nothing here."""
 
     @classmethod
     def _saved_attributes(cls, path: str | pathlib.Path | io.BufferedIOBase) -> dict[str, Any]:
@@ -438,6 +450,22 @@ class OptionOffPolicyAlgorithm(OffPolicyAlgorithm):
         if progress_bar:
             callbacks.append(OptionProgressBarCallback())
         return super()._init_callback(CallbackList(callbacks))
+
+    def learn(
+        self: SelfOptionOffPolicyAlgorithm,
+        total_timesteps: int,
+        callback: MaybeCallback = None,
+        log_interval: int = 4,
+        tb_log_name: str | None = None,
+        reset_num_timesteps: bool = True,
+        progress_bar: bool = False,
+    ) -> SelfOptionOffPolicyAlgorithm:
+        """Learn for ``total_timesteps`` primitive steps, up to the end of the option that reaches them.
+
+        Parameters are those of Stable-Baselines3's ``learn``; ``tb_log_name`` is the class's name by default.
+        """
+        name = type(self).__name__ if tb_log_name is None else tb_log_name
+        return super().learn(total_timesteps, callback, log_interval, name, reset_num_timesteps, progress_bar)
 
     def collect_rollouts(
         self,

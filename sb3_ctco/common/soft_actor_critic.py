@@ -18,9 +18,9 @@ from sb3_ctco.common.policies import EnsembleCritic, SoftOptionPolicy, SquashedA
 class SoftOptionActorCritic(OptionOffPolicyAlgorithm):
     """Soft actor-critic whose options have two parts: what to do, and for how long.
 
-    Each part has a temperature of its own. Subclasses say how the policy is sampled, what the critics learn, and how
-    the actor is judged: ``_sample_policy``, ``_q_values``, ``_critic_targets``, ``_critic_loss``, ``_actor_loss`` and
-    ``_auto_target_entropies``.
+    Each part has temperatures of its own, the duration one, and what to do as many as ``_n_temperatures`` says. Subclasses
+    say how the policy is sampled, what the critics learn, and how the actor is judged: ``_sample_policy``, ``_q_values``,
+    ``_critic_targets``, ``_critic_loss``, ``_actor_loss`` and ``_auto_target_entropies``.
 
     Parameters that :class:`~sb3_ctco.common.option_algorithm.OptionOffPolicyAlgorithm` has are documented there:
 
@@ -82,7 +82,7 @@ class SoftOptionActorCritic(OptionOffPolicyAlgorithm):
         raise NotImplementedError
 
     def _setup_temperatures(self) -> None:
-        """Both temperatures and all that belongs to them as vectors ``[2]``: what to do, and the duration."""
+        """All temperatures and what belongs to them as vectors ``[n + 1]``: those of what to do, and the duration's."""
         auto_target, auto_duration_target = self._auto_target_entropies()
         if isinstance(self.target_entropy, str):
             self.target_entropy = _parse_target_entropy("target_entropy", self.target_entropy, auto_target)
@@ -95,12 +95,25 @@ class SoftOptionActorCritic(OptionOffPolicyAlgorithm):
         if self.d_min == self.d_max:
             # A duration that is fixed has no entropy to be paid for.
             duration_coef, duration_learned = 0.0, False
-        self._ent_coef_learned = th.tensor([learned, duration_learned], device=self.device)
-        self._target_entropies = th.tensor(self._current_target_entropies(), device=self.device)
-        self.log_ent_coefs = th.tensor([coef, duration_coef], device=self.device).log().requires_grad_(True)
+        n = self._n_temperatures()
+        self._ent_coef_learned = th.tensor([learned] * n + [duration_learned], device=self.device)
+        self._target_entropies = th.zeros(n + 1, device=self.device)
+        self._update_target_entropies()
+        self.log_ent_coefs = th.tensor([coef] * n + [duration_coef], device=self.device).log().requires_grad_(True)
         self.ent_coef_optimizer: th.optim.Adam | None = None
         if learned or duration_learned:
             self.ent_coef_optimizer = th.optim.Adam([self.log_ent_coefs], lr=self.lr_schedule(1), fused=True)
+
+    def _after_load(self) -> None:
+        loaded, n = self.log_ent_coefs.detach(), self._n_temperatures()
+        if len(loaded) <= n:  # a file of 0.1.0, with one temperature of what to do
+            self._setup_temperatures()
+            with th.no_grad():
+                self.log_ent_coefs.copy_(th.cat((loaded[:1].repeat(n), loaded[1:])))
+
+    def _n_temperatures(self) -> int:
+        """How many temperatures what to do has."""
+        return 1
 
     def _current_target_entropies(self) -> tuple[float, float]:
         """The target entropies of what to do and of the duration, at the remaining progress."""
@@ -109,10 +122,15 @@ class SoftOptionActorCritic(OptionOffPolicyAlgorithm):
         remaining = self._current_progress_remaining
         return FloatSchedule(self.target_entropy)(remaining), FloatSchedule(self.duration_target_entropy)(remaining)
 
+    def _update_target_entropies(self) -> None:
+        target, duration_target = self._current_target_entropies()
+        self._target_entropies[:-1] = target / self._n_temperatures()
+        self._target_entropies[-1] = duration_target
+
     def _sample_policy(self, obs: PyTorchObs) -> tuple[th.Tensor, ...]:
         """Sample the policy, reparameterised.
 
-        :return: what to do, and log π of both parts as the columns of ``[batch, 2]``; more, if a subclass needs it
+        :return: what to do, and log π that each temperature is of, ``[batch, n + 1]``; more, if a subclass needs it
         """
         raise NotImplementedError
 
@@ -145,7 +163,7 @@ class SoftOptionActorCritic(OptionOffPolicyAlgorithm):
             optimizers.append(self.ent_coef_optimizer)
         self._update_learning_rate(optimizers)
 
-        self._target_entropies.copy_(th.tensor(self._current_target_entropies()))
+        self._update_target_entropies()
         losses = []
         with self._begin_updates() as update:
             for _ in range(gradient_steps):
@@ -155,10 +173,10 @@ class SoftOptionActorCritic(OptionOffPolicyAlgorithm):
         self.replay_buffer_kwargs["reward_scale"] = self.replay_buffer.reward_scale  # type: ignore[attr-defined]
         # Read once, because each reading waits for the device.
         pi_loss_mean, q_loss_mean, ent_coef_loss_mean = th.stack(losses).mean(dim=0).tolist()
-        ent_coef, duration_ent_coef = self.ent_coefs.tolist()
+        ent_coefs = self.ent_coefs
         self.logger.record("train/n_updates", self._n_updates, exclude="tensorboard")
-        self.logger.record("train/ent_coef", ent_coef)
-        self.logger.record("train/duration_ent_coef", duration_ent_coef)
+        self.logger.record("train/ent_coef", ent_coefs[:-1].mean().item())
+        self.logger.record("train/duration_ent_coef", ent_coefs[-1].item())
         self.logger.record("train/actor_loss", pi_loss_mean)
         self.logger.record("train/critic_loss", q_loss_mean)
         if self.ent_coef_optimizer is not None:
@@ -166,7 +184,7 @@ class SoftOptionActorCritic(OptionOffPolicyAlgorithm):
 
     @property
     def ent_coefs(self) -> th.Tensor:
-        """Both temperatures, of what to do and of the duration, ``[2]``, without gradients."""
+        """All temperatures, those of what to do and the duration's, ``[n + 1]``, without gradients."""
         return self.log_ent_coefs.detach().exp()
 
     @contextlib.contextmanager
@@ -176,7 +194,7 @@ class SoftOptionActorCritic(OptionOffPolicyAlgorithm):
 
     @property
     def log_ent_coef(self) -> th.Tensor:
-        """The logarithm of the temperature of what to do, ``[1]``, under the name that Stable-Baselines3's SAC has for it."""
+        """The logarithm of the first temperature of what to do, ``[1]``, under the name that Stable-Baselines3's SAC has."""
         return self.log_ent_coefs.detach()[:1]
 
     def _update(self, data: ReplayBufferSamples) -> th.Tensor:
@@ -203,9 +221,9 @@ class SoftOptionActorCritic(OptionOffPolicyAlgorithm):
         return th.stack((pi_loss.detach(), q_loss.detach(), ent_coef_loss))
 
     def _update_temperatures(self, log_prob: th.Tensor) -> th.Tensor:
-        """SAC's dual ascent on both temperatures.
+        """SAC's dual ascent on all temperatures.
 
-        :param log_prob: ``[batch, 2]``, over the normalised box
+        :param log_prob: ``[batch, n + 1]``, over the normalised box
         :return: the loss
         """
         if self.ent_coef_optimizer is None:
@@ -218,8 +236,8 @@ class SoftOptionActorCritic(OptionOffPolicyAlgorithm):
     def _temperature_gradient(self, log_prob: th.Tensor) -> tuple[th.Tensor, th.Tensor]:
         """The gradient of the temperatures' loss by their logarithms; zero for a temperature that is fixed.
 
-        :param log_prob: ``[batch, 2]``, over the normalised box
-        :return: the gradient, ``[2]``, and the loss
+        :param log_prob: ``[batch, n + 1]``, over the normalised box
+        :return: the gradient, ``[n + 1]``, and the loss
         """
         excess = th.where(self._ent_coef_learned, log_prob.mean(dim=0) + self._target_entropies, 0.0)
         # A temperature of zero is fixed and has no finite logarithm.

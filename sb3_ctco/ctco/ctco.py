@@ -3,13 +3,13 @@
 import contextlib
 import math
 from collections.abc import Callable, Iterator
-from typing import Any, ClassVar, Literal, TypeVar
+from typing import Any, ClassVar, Literal
 
 import torch as th
 from stable_baselines3.common.buffers import ReplayBuffer
 from stable_baselines3.common.noise import ActionNoise
 from stable_baselines3.common.policies import BasePolicy
-from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, PyTorchObs, ReplayBufferSamples, Schedule
+from stable_baselines3.common.type_aliases import GymEnv, PyTorchObs, ReplayBufferSamples, Schedule
 from stable_baselines3.common.utils import FloatSchedule, update_learning_rate
 from torch import nn
 
@@ -19,14 +19,12 @@ from sb3_ctco.common.soft_actor_critic import SoftOptionActorCritic
 from sb3_ctco.ctco.canonical import CanonicalOptions
 from sb3_ctco.ctco.fast_update import FastUpdate
 from sb3_ctco.ctco.policies import CnnPolicy, CTCOPolicy, MlpPolicy, MultiInputPolicy, OptionActor, OptionCritic
-from sb3_ctco.options import DurationScale, Join, Trajectory
-
-SelfCTCO = TypeVar("SelfCTCO", bound="CTCO")
+from sb3_ctco.options import DurationScale, Join, Trajectory, default_durations, discount_rate_from_gamma
 
 
-def _longest(d_max: float | None, gamma_dt: float) -> float:
-    """The longest duration, in s: by default what follows from the horizon as the user states it."""
-    return 10.0 * gamma_dt if d_max is None else d_max
+def _longest(d_max: float | None, gamma: float, gamma_dt: float) -> float:
+    """The longest duration, in s: by default what follows from the discount."""
+    return default_durations(discount_rate_from_gamma(gamma, gamma_dt))[1] if d_max is None else d_max
 
 
 class CTCO(SoftOptionActorCritic):
@@ -64,8 +62,9 @@ class CTCO(SoftOptionActorCritic):
     :param n_sub_options: how many random stretches of each option that was played go into the replay buffer beside it,
         as options of their own, which counts in ``buffer_size``; 0 is the paper's way
     :param n_rbf: number of radial basis functions an action dimension
-    :param d_max: longest duration of an option, in s; ten ``gamma_dt`` by default
-    :param d_min: shortest duration, in s; by default one step of the environment
+    :param d_max: longest duration of an option, in s; by default a fifth of the horizon 1/τ, and 0.5 s at most
+    :param d_min: shortest duration, in s, and never less than one step of the environment, which 0 stands for; by default a
+        hundredth of the horizon, and 0.025 s at most, see :func:`~sb3_ctco.options.default_durations`
     :param dt: interaction period of the environment, in s; by default found in the environment
     :param trajectory: how ω becomes actions: ``"rbf"``, the paper's radial basis functions, ``"bezier"``, or a subclass of
         :class:`~sb3_ctco.options.Trajectory`
@@ -79,7 +78,8 @@ class CTCO(SoftOptionActorCritic):
         progress
     :param target_decision_rate: in Hz, in place of a fixed β_h: ``high_freq_penalty`` is where β_h starts, and it rises
         while the policy decides more often than this, and falls while it decides less often
-    :param ent_coef: temperature of ω: a number, ``"auto"`` to learn it, or ``"auto_0.1"`` to start at 0.1
+    :param ent_coef: temperature of ω: a number, ``"auto"`` to learn one for each of the ``n_rbf`` weights of a trajectory, or
+        ``"auto_0.1"`` to start at 0.1
     :param duration_ent_coef: temperature of d, likewise
     :param target_entropy: entropy of ω over the box [−1, 1] that a learned temperature keeps, or a function of the
         remaining progress; ``"auto"`` is −dim(ω)
@@ -88,9 +88,8 @@ class CTCO(SoftOptionActorCritic):
         one nat a dimension in all: explore first, then get precise; 0 keeps them
     :param duration_learning_rate: step size of d's head; ``learning_rate`` by default
     :param entropy_reference: ``"uniform"``, ``"average"`` or ``"paper"``, see :func:`log_reference_density`
-    :param canonical_weights: whether critics see, in the place of ω, weights that are the same for all options that play the
-        same actions, which makes a difference to options of fewer steps than ``n_rbf``, see
-        :class:`~sb3_ctco.ctco.canonical.CanonicalOptions`
+    :param canonical_options: whether critics see the same vector for all options that play the same actions, see
+        :class:`~sb3_ctco.ctco.canonical.CanonicalOptions`; without it they see ω and d as they are, the paper's way
     :param fast_updates: whether to compute gradients without autograd where that is known to give the same, see
         :mod:`sb3_ctco.ctco.fast_update`; ``fast_updates_refusal`` says why not where it is not
     :param action_noise: noise added to normalised options while exploring
@@ -107,6 +106,10 @@ class CTCO(SoftOptionActorCritic):
     """
 
     _own_setting: ClassVar[str] = "high_freq_penalty"
+    _before_it_was_saved: ClassVar[dict[str, Any]] = {
+        **SoftOptionActorCritic._before_it_was_saved,
+        "canonical_options": False,
+    }
 
     policy_aliases: ClassVar[dict[str, type[BasePolicy]]] = {
         "MlpPolicy": MlpPolicy,
@@ -151,7 +154,7 @@ class CTCO(SoftOptionActorCritic):
         target_entropy_anneal: float = 0.0,
         duration_learning_rate: float | Schedule | None = None,
         entropy_reference: EntropyReference = "uniform",
-        canonical_weights: bool = False,
+        canonical_options: bool = False,
         fast_updates: bool = True,
         action_noise: ActionNoise | None = None,
         replay_buffer_class: type[ReplayBuffer] | None = None,
@@ -185,7 +188,7 @@ class CTCO(SoftOptionActorCritic):
             env,
             learning_rate,
             n_rbf=n_rbf,
-            d_max=_longest(d_max, gamma_dt),
+            d_max=_longest(d_max, gamma, gamma_dt),
             d_min=d_min,
             dt=dt,
             trajectory=trajectory,
@@ -219,7 +222,7 @@ class CTCO(SoftOptionActorCritic):
         self.high_freq_penalty = high_freq_penalty
         self.target_decision_rate = target_decision_rate
         self.target_entropy_anneal = target_entropy_anneal
-        self.canonical_weights = canonical_weights
+        self.canonical_options = canonical_options
         self.fast_updates = fast_updates
         self.duration_learning_rate = duration_learning_rate
         self.entropy_reference: EntropyReference = entropy_reference
@@ -233,7 +236,8 @@ class CTCO(SoftOptionActorCritic):
 
         :param arguments: the algorithm's arguments, defaults included
         """
-        return super().wrapper_kwargs({**arguments, "d_max": _longest(arguments["d_max"], arguments["gamma_dt"])})
+        longest = _longest(arguments["d_max"], arguments["gamma"], arguments["gamma_dt"])
+        return super().wrapper_kwargs({**arguments, "d_max": longest})
 
     @staticmethod
     def paper_defaults() -> dict[str, Any]:
@@ -252,22 +256,28 @@ class CTCO(SoftOptionActorCritic):
             "batch_size": 100,
             "n_sub_options": 0,
             "n_rbf": 3,
+            "d_min": 0.0,
             "high_freq_penalty": 0.05,
             "reward_scale": 1.0,
             "trajectory": "rbf",
             "duration_scale": "linear",
             "join": "free",
+            "canonical_options": False,
             "entropy_reference": "paper",
             "policy_kwargs": {"n_critics": 1, "net_arch": {"pi": [10, 10], "qf": [64, 64]}},
         }
 
     def _setup_model(self) -> None:
         super()._setup_model()
-        space = self.option_space
-        #: What makes options canonical for the critics; None where it makes no difference or is not wanted
-        self.canonical_options: CanonicalOptions | None = None
-        if self.canonical_weights and not CanonicalOptions.makes_no_difference(space):
-            self.canonical_options = CanonicalOptions(space, self.device)
+        space, n = self.option_space, self._n_temperatures()
+        # Which temperature each entry of an option has: weights by where they stand in an action's trajectory, and d's own.
+        self._parts = th.zeros(self.actor.omega_dim + 1, n + 1, device=self.device)
+        self._parts[:-1, :n] = th.eye(n, device=self.device).repeat(self.actor.omega_dim // n, 1)
+        self._parts[-1, -1] = 1.0
+        # None where it makes no difference or is not wanted
+        self._canonical: CanonicalOptions | None = None
+        if self.canonical_options and not CanonicalOptions.makes_no_difference(space):
+            self._canonical = CanonicalOptions(space, self.device)
         self._fast_update: FastUpdate | None = None
         #: Why updates were made with autograd in the last training; None if they were not
         self.fast_updates_refusal: str | None = None
@@ -278,13 +288,7 @@ class CTCO(SoftOptionActorCritic):
             #: What the replay buffer had counted at the last training: decisions, and their time in s; a file's goes on.
             self._counted_decisions: tuple[int, float] = getattr(self, "_counted_decisions", (0, 0.0))
         self._last_next_values: tuple[th.Tensor, th.Tensor] | None = None
-        assert self.d_min is not None
-        # Read from the batch where it is "average"
-        self._log_reference: th.Tensor | None = None
-        if self.entropy_reference != "average":
-            self._log_reference = log_reference_density(
-                self.actor.omega_dim, self.d_min, self.d_max, self.entropy_reference, th.zeros(1, 2)
-            ).to(self.device)
+        self._log_reference = log_reference_density(self._parts.sum(dim=0), space.d_min, space.d_max, self.entropy_reference)
 
     def _networks_and_targets(self) -> list[tuple[nn.Module, nn.Module]]:
         return [*super()._networks_and_targets(), (self.actor, self.actor_target)]
@@ -292,6 +296,10 @@ class CTCO(SoftOptionActorCritic):
     def _create_aliases(self) -> None:
         super()._create_aliases()
         self.actor_target = self.policy.actor_target
+
+    def _n_temperatures(self) -> int:
+        # A short option feels little of its later weights: under one temperature these would have all of the entropy.
+        return self.n_rbf
 
     def _auto_target_entropies(self) -> tuple[float, float]:
         return float(-self.actor.omega_dim), -1.0
@@ -310,21 +318,22 @@ class CTCO(SoftOptionActorCritic):
             self.actor.optimizer.param_groups[1]["lr"] = step_size
 
     def entropy_costs(self, log_prob: th.Tensor) -> th.Tensor:
-        """β_E log π relative to the reference, ω's and d's with their own temperature.
+        """β_E log π relative to the reference, each part's with its own temperature.
 
-        :param log_prob: log π(ω|s) and log π(d|s) of those, ``[batch, 2]``
+        :param log_prob: of each part, ``[batch, n_weights + 1]``
         :return: ``[batch, 1]``
         """
         reference = log_prob.mean(dim=0) if self._log_reference is None else self._log_reference
         return ((log_prob - reference) @ self.ent_coefs)[:, None]
 
     def _sample_policy(self, obs: PyTorchObs) -> tuple[th.Tensor, ...]:
-        return self.actor.option_log_prob(obs)
+        options, log_prob = self.actor.option_log_prob(obs)
+        return options, log_prob @ self._parts
 
     def _critic_targets(self, data: ReplayBufferSamples) -> th.Tensor:
         next_options, next_log_prob = self.actor_target.option_log_prob(data.next_observations)
         next_q_values = self.critic_target(data.next_observations, self._as_critics_see(next_options))
-        return self._targets(data, next_q_values, self.entropy_costs(next_log_prob))
+        return self._targets(data, next_q_values, self.entropy_costs(next_log_prob @ self._parts))
 
     def _targets(self, data: ReplayBufferSamples, next_q_values: th.Tensor, next_entropy_costs: th.Tensor) -> th.Tensor:
         """What the critics learn, ``[batch, 1]``.
@@ -351,7 +360,7 @@ class CTCO(SoftOptionActorCritic):
         return self.critic(data.observations, self._as_critics_see(data.actions))
 
     def _as_critics_see(self, options: th.Tensor) -> th.Tensor:
-        return options if self.canonical_options is None else self.canonical_options(options)
+        return options if self._canonical is None else self._canonical(options)
 
     def train(self, gradient_steps: int, batch_size: int = 64) -> None:
         """Sample the replay buffer and update temperatures, critics, actor and targets.
@@ -415,33 +424,12 @@ class CTCO(SoftOptionActorCritic):
         self.log_high_freq_penalty.grad = th.tensor(-shortfall)
         self.high_freq_penalty_optimizer.step()
 
-    def learn(
-        self: SelfCTCO,
-        total_timesteps: int,
-        callback: MaybeCallback = None,
-        log_interval: int = 4,
-        tb_log_name: str = "CTCO",
-        reset_num_timesteps: bool = True,
-        progress_bar: bool = False,
-    ) -> SelfCTCO:
-        """Learn for ``total_timesteps`` primitive steps, up to the end of the option that reaches them.
-
-        Parameters are those of Stable-Baselines3's ``learn``.
-        """
-        return super().learn(
-            total_timesteps=total_timesteps,
-            callback=callback,
-            log_interval=log_interval,
-            tb_log_name=tb_log_name,
-            reset_num_timesteps=reset_num_timesteps,
-            progress_bar=progress_bar,
-        )
-
     def _excluded_save_params(self) -> list[str]:
         derived = [
             "actor_target",
-            "canonical_options",
+            "_canonical",
             "_log_reference",
+            "_parts",
             "_last_next_values",
             "_fast_update",
             "fast_updates_refusal",

@@ -41,7 +41,7 @@ class FastUpdate:
 
     def __init__(self, model: CTCO):
         self._model = model
-        self._actors = _PlainActors(model.actor, model.actor_target)
+        self._actors = _PlainActors(model.actor, model.actor_target, model._parts)
         self._critics = PlainNetworks(_layers(model.critic.q_networks), _layers(model.critic_target.q_networks))
         self._memory = _memory(model.policy.parameters())
 
@@ -130,8 +130,8 @@ class FastUpdate:
         q_min = q_values.amin(dim=0)
         pi_loss = (model.entropy_costs(log_prob[0]) - q_min).mean()
         option_gradient = self._critics.input_gradient((q_values == q_min) / -batch_size, first=features.shape[2])
-        if model.canonical_options is not None:
-            option_gradient = model.canonical_options.gradient(option_gradient, options[0])
+        if model._canonical is not None:
+            option_gradient = model._canonical.gradient(option_gradient, options[0])
         self._actors.backward(option_gradient, model.ent_coefs / batch_size)
         self._actor_adam.step()
 
@@ -244,7 +244,7 @@ class PlainNetworks:
 class _PlainActors:
     """The actor of :class:`~sb3_ctco.ctco.policies.OptionActor` and its target: samples, and the actor's gradients."""
 
-    def __init__(self, actor: OptionActor, target: OptionActor):
+    def __init__(self, actor: OptionActor, target: OptionActor, parts: th.Tensor):
         self._n = n = actor.omega_dim
 
         def layers(actor: OptionActor) -> list[list[Part]]:
@@ -254,16 +254,14 @@ class _PlainActors:
 
         self.networks = PlainNetworks(layers(actor), layers(target))
         self._scale = actor.squash_scale
-        # Sums the columns of ω in its first column, and has those of d in its second.
-        self._parts = th.zeros(n + 1, 2, device=self._scale.device)
-        self._parts[:-1, 0] = self._parts[-1, 1] = 1.0
+        self._parts = parts
         self._constants = (-self._scale.log() - 0.5 * math.log(2 * math.pi) - 2.0 * math.log(2.0)) @ self._parts
 
     def sample(self, obs: th.Tensor) -> tuple[th.Tensor, th.Tensor]:
-        """``OptionActor.option_log_prob``: options, and log π of their parts, of both actors.
+        """``CTCO._sample_policy``: options, and log π of their parts, of both actors.
 
         :param obs: ``[2, batch, features]``
-        :return: ``[2, batch, omega_dim + 1]`` and ``[2, batch, 2]``
+        :return: ``[2, batch, omega_dim + 1]`` and ``[2, batch, n_weights + 1]``
         """
         mean, raw_log_std = self.networks.forward(obs).split(self._n + 1, dim=2)
         log_std = raw_log_std.clamp(LOG_STD_MIN, LOG_STD_MAX)
@@ -282,7 +280,7 @@ class _PlainActors:
         """Compute the gradients of the actor's parameters from those of its last sample.
 
         :param option_gradient: of the options, ``[batch, omega_dim + 1]``
-        :param log_prob_gradient: of log π of both parts, the same for the whole batch, ``[2]``
+        :param log_prob_gradient: of log π of the parts, the same for the whole batch, ``[n_weights + 1]``
         """
         log_prob_gradient = self._parts @ log_prob_gradient
         # The derivative of squashed_log_prob by y, with the noise fixed, is 2·tanh(y); by log_std it is −1.

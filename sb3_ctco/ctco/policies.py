@@ -65,16 +65,14 @@ class OptionActor(SquashedActor):
     def option_log_prob(self, obs: PyTorchObs) -> tuple[th.Tensor, th.Tensor]:
         """Reparameterised sample f_θ(s; ε) of section "The Policy", and its log-densities.
 
-        :return: options ``[batch, omega_dim + 1]`` in [−1, 1], and log π(ω|s), log π(d|s) as the columns of
-            ``[batch, 2]``, densities over the normalised box
+        :return: options ``[batch, omega_dim + 1]`` in [−1, 1], and log π of each of their entries, likewise: densities over
+            the normalised box
         """
         mean, log_std = self.distribution_parameters(obs)
         noise = th.randn_like(mean)
         # y = x·scale is what tanh is taken of; its density is Gaussian with the scaled deviation.
         y = (mean + noise * log_std.exp()) * self.squash_scale
-        log_prob = squashed_log_prob(noise, log_std, y) - self.squash_scale.log()
-        omega_log_prob = log_prob[:, :-1].sum(dim=1)
-        return y.tanh(), th.stack((omega_log_prob, log_prob[:, -1]), dim=1)
+        return y.tanh(), squashed_log_prob(noise, log_std, y) - self.squash_scale.log()
 
     def forward(self, obs: PyTorchObs, deterministic: bool = False) -> th.Tensor:
         """Options ``[batch, omega_dim + 1]`` in [−1, 1]: sampled, or those of the means."""

@@ -2,7 +2,7 @@
 
 import math
 from functools import cached_property
-from typing import Any, Literal
+from typing import Any, ClassVar, Literal
 
 import numpy as np
 import torch as th
@@ -105,7 +105,7 @@ class DACPolicy(BasePolicy):
     :param activation_fn: activation function
     :param ortho_init: whether to initialise orthogonally
     :param n_options: K
-    :param features_extractor_class: features extractor to use
+    :param features_extractor_class: features extractor to use, in place of the class's own
     :param features_extractor_kwargs: keyword arguments of the features extractor
     :param share_features_extractor: whether q sees the features of the actors, or has an extractor of its own
     :param normalize_images: whether to divide images by 255
@@ -115,6 +115,7 @@ class DACPolicy(BasePolicy):
     """
 
     action_space: spaces.Box
+    default_features_extractor: ClassVar[type[BaseFeaturesExtractor]] = FlattenExtractor
 
     def __init__(
         self,
@@ -125,7 +126,7 @@ class DACPolicy(BasePolicy):
         activation_fn: type[nn.Module] = nn.Tanh,
         ortho_init: bool = True,
         n_options: int = 4,
-        features_extractor_class: type[BaseFeaturesExtractor] = FlattenExtractor,
+        features_extractor_class: type[BaseFeaturesExtractor] | None = None,
         features_extractor_kwargs: dict[str, Any] | None = None,
         share_features_extractor: bool = True,
         normalize_images: bool = True,
@@ -142,7 +143,7 @@ class DACPolicy(BasePolicy):
         super().__init__(
             observation_space,
             action_space,
-            features_extractor_class,
+            features_extractor_class or self.default_features_extractor,
             features_extractor_kwargs,
             optimizer_class=optimizer_class,
             optimizer_kwargs=optimizer_kwargs,
@@ -312,30 +313,10 @@ MlpPolicy = DACPolicy
 class CnnPolicy(DACPolicy):
     """:class:`DACPolicy` with Stable-Baselines3's ``NatureCNN`` as features extractor."""
 
-    def __init__(
-        self,
-        observation_space: spaces.Space,
-        action_space: spaces.Box,
-        lr_schedule: Schedule,
-        features_extractor_class: type[BaseFeaturesExtractor] = NatureCNN,
-        **kwargs: Any,
-    ):
-        super().__init__(
-            observation_space, action_space, lr_schedule, features_extractor_class=features_extractor_class, **kwargs
-        )
+    default_features_extractor = NatureCNN
 
 
 class MultiInputPolicy(DACPolicy):
     """:class:`DACPolicy` with Stable-Baselines3's ``CombinedExtractor``, for dictionary observations."""
 
-    def __init__(
-        self,
-        observation_space: spaces.Space,
-        action_space: spaces.Box,
-        lr_schedule: Schedule,
-        features_extractor_class: type[BaseFeaturesExtractor] = CombinedExtractor,
-        **kwargs: Any,
-    ):
-        super().__init__(
-            observation_space, action_space, lr_schedule, features_extractor_class=features_extractor_class, **kwargs
-        )
+    default_features_extractor = CombinedExtractor

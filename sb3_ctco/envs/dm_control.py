@@ -148,7 +148,7 @@ class DMControlEnv(gym.Env[np.ndarray, np.ndarray]):
         steps_left, self._steps_left = self._steps_left, 0
         actions = actions[: int(min(steps_left, len(actions)))]
         observe = [k for k in observe if k < len(actions)]
-        play = self._step_in_a_loop if self._rewards is None else self._roll_out
+        play = self._step_in_a_loop if self._rewards is None else self._step_once if len(actions) == 1 else self._roll_out
         try:
             with self._physics.check_invalid_state():
                 rewards, discount, observations = play(actions, observe)
@@ -164,27 +164,37 @@ class DMControlEnv(gym.Env[np.ndarray, np.ndarray]):
 
     def _step_in_a_loop(self, actions: np.ndarray, observe: Sequence[int]) -> _Played:
         """Any task, by dm_control's own functions."""
-        model, data, n_more, rk4 = self._model, self._data, self._n_sub_steps - 1, self._uses_rk4
-        task, physics, ctrl = self._task, self._physics, data.ctrl
+        task, physics = self._task, self._physics
         rewards: list[float] = []
         observations: list[np.ndarray] = []
         for action in actions:
             if len(rewards) in observe:
                 observations.append(self._flat_observation())
-            ctrl[:] = action
-            # dm_control's legacy step: mj_step1 at the end leaves positions and velocities in sync.
-            if rk4:
-                mujoco.mj_step(model, data, n_more + 1)
-            else:
-                mujoco.mj_step2(model, data)
-                if n_more:
-                    mujoco.mj_step(model, data, n_more)
-            mujoco.mj_step1(model, data)
+            self._advance(action)
             rewards.append(task.get_reward(physics))
             discount = task.get_termination(physics)
             if discount is not None:
                 break
         return np.array(rewards, dtype=np.float64), discount, observations
+
+    def _advance(self, action: np.ndarray) -> None:
+        """dm_control's legacy step: mj_step1 at the end leaves positions and velocities in sync."""
+        model, data, n_sub_steps = self._model, self._data, self._n_sub_steps
+        data.ctrl[:] = action
+        if self._uses_rk4:
+            mujoco.mj_step(model, data, n_sub_steps)
+        else:
+            mujoco.mj_step2(model, data)
+            if n_sub_steps > 1:
+                mujoco.mj_step(model, data, n_sub_steps - 1)
+        mujoco.mj_step1(model, data)
+
+    def _step_once(self, actions: np.ndarray, observe: Sequence[int]) -> _Played:
+        """One step of a task whose reward is a function of arrays: quicker than rolling it out."""
+        self._advance(actions[0])
+        data = self._data
+        assert self._rewards is not None
+        return self._rewards(data.qpos[None], data.sensordata[None], data.ctrl[None]), None, []
 
     def _roll_out(self, actions: np.ndarray, observe: Sequence[int]) -> _Played:
         """The same for tasks whose reward is a function of arrays, and whose episodes do not terminate: all in C.

@@ -1,7 +1,7 @@
 """Fine-Grained Action Repetition (Sharma et al. 2017, https://arxiv.org/abs/1702.06054) on soft actor-critic."""
 
 import math
-from typing import Any, ClassVar, TypeVar
+from typing import Any, ClassVar
 
 import gymnasium as gym
 import numpy as np
@@ -9,7 +9,7 @@ import torch as th
 from stable_baselines3.common.buffers import ReplayBuffer
 from stable_baselines3.common.noise import ActionNoise
 from stable_baselines3.common.policies import BasePolicy
-from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, PyTorchObs, ReplayBufferSamples, Schedule
+from stable_baselines3.common.type_aliases import GymEnv, PyTorchObs, ReplayBufferSamples, Schedule
 from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_ctco.common.losses import critic_target, repeated_actor_loss, repetition_values
@@ -26,8 +26,6 @@ from sb3_ctco.figar_sac.policies import (
 )
 from sb3_ctco.options import OptionSpace, steps_in
 from sb3_ctco.wrappers import OptionExecutionWrapper, find_dt
-
-SelfFiGARSAC = TypeVar("SelfFiGARSAC", bound="FiGARSAC")
 
 
 class FiGARSAC(SoftOptionActorCritic):
@@ -144,7 +142,7 @@ class FiGARSAC(SoftOptionActorCritic):
             learning_rate,
             n_rbf=1,
             d_max=d_max,
-            d_min=None,
+            d_min=0.0,
             dt=dt,
             gamma=gamma,
             gamma_dt=gamma_dt,
@@ -187,7 +185,7 @@ class FiGARSAC(SoftOptionActorCritic):
             )
         if d_max is None:
             d_max = (20 if n_repetitions is None else n_repetitions) * dt
-        fixed = {"n_rbf": 1, "d_min": None, "duration_scale": "linear", "join": "free"}
+        fixed = {"n_rbf": 1, "d_min": 0.0, "duration_scale": "linear", "join": "free"}
         return super().wrapper_kwargs({**arguments, **fixed, "d_max": d_max})
 
     def _resolve_repetitions(self, dt: float) -> None:
@@ -284,25 +282,3 @@ class FiGARSAC(SoftOptionActorCritic):
     def _actor_loss(self, obs: PyTorchObs, sample: tuple[th.Tensor, ...]) -> th.Tensor:
         actions, log_prob, repetition_log_probs = sample
         return repeated_actor_loss(self.critic(obs, actions), log_prob[:, 0], repetition_log_probs, self.ent_coefs)
-
-    def learn(
-        self: SelfFiGARSAC,
-        total_timesteps: int,
-        callback: MaybeCallback = None,
-        log_interval: int = 4,
-        tb_log_name: str = "FiGARSAC",
-        reset_num_timesteps: bool = True,
-        progress_bar: bool = False,
-    ) -> SelfFiGARSAC:
-        """Learn for ``total_timesteps`` primitive steps, up to the end of the repetition that reaches them.
-
-        Parameters are those of Stable-Baselines3's ``learn``.
-        """
-        return super().learn(
-            total_timesteps=total_timesteps,
-            callback=callback,
-            log_interval=log_interval,
-            tb_log_name=tb_log_name,
-            reset_num_timesteps=reset_num_timesteps,
-            progress_bar=progress_bar,
-        )

@@ -17,13 +17,7 @@ R              ``integrated_reward``                        reward rate × s
 """
 
 from sb3_ctco.options.interrupts import ValueInterrupt
-from sb3_ctco.options.joins import (
-    LAST_ACTION,
-    OBSERVATION,
-    with_last_action,
-    with_last_action_space,
-    without_last_action_space,
-)
+from sb3_ctco.options.joins import LAST_ACTION, OBSERVATION, with_last_action, with_last_action_space
 from sb3_ctco.options.semi_mdp import (
     DEFAULT_DISCOUNT_RATE,
     PLAYED,
@@ -38,7 +32,7 @@ from sb3_ctco.options.semi_mdp import (
     step_weight,
     steps_in,
 )
-from sb3_ctco.options.space import DURATION_SCALES, JOINS, ActionBox, DurationScale, Join, OptionSpace
+from sb3_ctco.options.space import DURATION_SCALES, JOINS, ActionBox, DurationScale, Join, OptionSpace, default_durations
 from sb3_ctco.options.sub_options import Stacked, SubOptions, draw_stretches, rows_of, shortest_steps, stack, sub_options
 from sb3_ctco.options.trajectory import TRAJECTORIES, BezierCurve, RadialBasis, Trajectory, basis_of_steps
 
@@ -65,6 +59,7 @@ __all__ = [
     "Trajectory",
     "ValueInterrupt",
     "basis_of_steps",
+    "default_durations",
     "discount",
     "discount_rate_from_gamma",
     "discounts_of_steps",
@@ -78,5 +73,4 @@ __all__ = [
     "sub_options",
     "with_last_action",
     "with_last_action_space",
-    "without_last_action_space",
 ]

@@ -38,15 +38,6 @@ def with_last_action_space(space: spaces.Space, action_dim: int) -> spaces.Space
     return spaces.Dict({OBSERVATION: space, LAST_ACTION: actions})
 
 
-def without_last_action_space(space: spaces.Space, action_dim: int) -> spaces.Space:
-    """The environment's space, of the one that :func:`with_last_action_space` made of it."""
-    if isinstance(space, spaces.Box):
-        return spaces.Box(space.low[:-action_dim], space.high[:-action_dim], dtype=space.dtype)  # type: ignore[arg-type]
-    assert isinstance(space, spaces.Dict)
-    parts = {key: part for key, part in space.spaces.items() if key != LAST_ACTION}
-    return parts[OBSERVATION] if parts.keys() == {OBSERVATION} else spaces.Dict(parts)
-
-
 def with_last_action(space: spaces.Space, observation: Any, action: FloatArray) -> Any:
     """An observation that holds the last action, or several with a leading axis.
 

@@ -7,13 +7,26 @@ from typing import Any, Literal
 import numpy as np
 import numpy.typing as npt
 
-from sb3_ctco.options.semi_mdp import FloatArray, steps_in
+from sb3_ctco.options.semi_mdp import DEFAULT_DISCOUNT_RATE, FloatArray, steps_in
 from sb3_ctco.options.trajectory import TRAJECTORIES, Trajectory
 
 DurationScale = Literal["log", "linear"]
 DURATION_SCALES: tuple[DurationScale, ...] = ("log", "linear")
 Join = Literal["free", "continuous"]
 JOINS: tuple[Join, ...] = ("free", "continuous")
+
+
+def default_durations(discount_rate: float) -> tuple[float, float]:
+    """The shortest and the longest duration where none is given, in s: they discount by 0.99 and by 0.82.
+
+    An agent that decides much more often than that drowns its own exploration, and one of a fixed rate with the usual discount
+    of 0.99 a step decides just that often. With the paper's discount, 0.98 over 0.05 s, they are 0.025 and 0.5 s, and they are
+    never longer.
+
+    :param discount_rate: τ, in 1/s
+    """
+    discount_rate = max(discount_rate, DEFAULT_DISCOUNT_RATE)
+    return -math.log(0.99) / discount_rate, -10 * math.log(0.98) / discount_rate
 
 
 @dataclass(frozen=True)
@@ -50,7 +63,7 @@ class OptionSpace:
         if self.d_min > self.d_max:
             raise ValueError(
                 f"d_min={self.d_min} s is longer than d_max={self.d_max} s: "
-                "raise d_max, or pass a d_min (by default one step, dt) that is at most d_max"
+                f"raise d_max, or pass a smaller d_min (an option takes one step, dt={self.dt} s, or more)"
             )
         if not (self.discount_rate >= 0 and math.isfinite(self.discount_rate)):
             raise ValueError(f"discount_rate must be a finite number of 1/s that is at least 0, not {self.discount_rate}")
@@ -144,17 +157,16 @@ class OptionSpace:
         """
         return option[:-1].reshape(-1, self.trajectory.n_weights), steps_in(self.duration(option), self.dt)
 
-    def stretch(self, plan: FloatArray, first: int, end: int, before: FloatArray | None = None) -> tuple[FloatArray, float]:
-        """The option that comes closest to a stretch of a plan.
+    def closest(self, plan: FloatArray, before: FloatArray | None = None) -> tuple[FloatArray, float]:
+        """The option that comes closest to a plan.
 
         :param plan: normalised actions, shape ``[n_steps, action_dim]``
-        :param first: the first step of the stretch
-        :param end: the step after its last
-        :param before: with a continuous join the action from which the plan leaves, normalised
+        :param before: with a continuous join the action from which it leaves, normalised, shape ``[action_dim]``
         :return: the option vector, float32, and the largest deviation of its actions from the plan
         """
-        omega, residuals = self.trajectory.fit(plan, np.array([first]), np.array([end]), before)
-        return self.encode(omega, np.array([end - first]))[0], float(residuals[0])
+        ends = np.array([len(plan)])
+        omega, residuals = self.trajectory.fit(plan, np.array([0]), ends, None if before is None else before[None])
+        return self.encode(omega, ends)[0], float(residuals[0])
 
     def plan(self, option: FloatArray, before: FloatArray | None = None) -> FloatArray:
         """All actions of an option, normalised.
@@ -204,7 +216,7 @@ class ActionBox:
             raise ValueError(f"actions must have shape [n, *{self.low.shape}], not {given.shape}")
         # Where both bounds are the same, there is nothing to say, which is 0.
         width = np.where(self._half_width > 0, self._half_width, 1.0)
-        return (given.reshape(len(given), -1) - self._bottom - self._half_width) / width
+        return (given.reshape(len(given), self._bottom.size) - self._bottom - self._half_width) / width
 
     def cast(self, actions: FloatArray) -> npt.NDArray[Any]:
         """Actions in the units of the box, in its shape and precision: ``[n_steps, *action_shape]``."""

@@ -127,7 +127,8 @@ def sub_options(
     :param truncated: whether it was truncated with it
     :param reward_unit: ``"rate"`` or ``"impulse"``, see :func:`~sb3_ctco.options.integrated_reward`
     :param tolerance: largest deviation that a stretch's fitted actions may have, normalised
-    :param before: with a continuous join the normalised action that was being sent when the option began, ``[action_dim]``
+    :param before: with a continuous join the normalised action that was being sent at each row of ``seen``,
+        ``[n_seen, action_dim]``, from which an option that begins there leaves
     """
     n_ran = len(rewards)
     firsts, ends = np.array(stretches, dtype=np.int64).reshape(-1, 2).T
@@ -135,7 +136,9 @@ def sub_options(
         ends = np.minimum(ends, n_ran)
         long_enough = ends - firsts >= shortest_steps(space)
         firsts, ends = firsts[long_enough], ends[long_enough]
-    omega, residuals = space.trajectory.fit(plan, firsts, ends, before)
+    rows = np.array(steps)
+    starts = None if before is None else before[rows.searchsorted(firsts)]
+    omega, residuals = space.trajectory.fit(plan, firsts, ends, starts)
     kept = residuals <= tolerance
     if not kept.all():
         firsts, ends, omega, residuals = firsts[kept], ends[kept], omega[kept], residuals[kept]
@@ -144,7 +147,7 @@ def sub_options(
     total = np.zeros(n_ran + 1)
     (rewards * discounts).cumsum(out=total[1:])
     weight = step_weight(space.dt, space.discount_rate) if reward_unit == "rate" else 1.0
-    lengths, at_end, rows = ends - firsts, ends == n_ran, np.array(steps)
+    lengths, at_end = ends - firsts, ends == n_ran
     return SubOptions(
         seen=seen,
         begins=rows.searchsorted(firsts),

@@ -70,7 +70,7 @@ class Trajectory(ABC):
         plan: FloatArray,
         firsts: npt.NDArray[np.integer],
         ends: npt.NDArray[np.integer],
-        start: FloatArray | None = None,
+        starts: FloatArray | None = None,
     ) -> tuple[FloatArray, FloatArray]:
         """The options whose actions come closest to stretches of a plan: least squares, clipped to [−1, 1].
 
@@ -79,26 +79,27 @@ class Trajectory(ABC):
         :param plan: normalised actions, shape ``[n_steps, action_dim]``
         :param firsts: the first step of each stretch, shape ``[n]``
         :param ends: the step after its last, shape ``[n]``
-        :param start: the action that the plan leaves from, shape ``[action_dim]``; each stretch then leaves from the action
-            before its first step. None for options that begin anywhere
+        :param starts: the actions that the stretches leave from, shape ``[n, action_dim]``; None if they begin anywhere
         :return: ω, shape ``[n, action_dim, n_weights]``, and the residuals, the largest deviation of an action from the
             plan, shape ``[n]``
         """
         if not len(firsts):
             return np.empty((0, plan.shape[1], self.n_weights)), np.empty(0)
-        joined = start is not None
+        joined = starts is not None
         if joined:
             # The action before a stretch is a row of it, and a weight that is known.
-            plan, ends = np.vstack([start, plan]), ends + 1
+            plan, ends = np.vstack([plan[:1], plan]), ends + 1
         lengths = ends - firsts
-        # One row a step, the stretches one after the other: they begin at the rows `starts`.
-        starts = lengths.cumsum() - lengths
+        # One row a step, the stretches one after the other: they begin at the rows `begins`.
+        begins = lengths.cumsum() - lengths
         actions = np.concatenate([plan[first:end] for first, end in zip(firsts.tolist(), ends.tolist(), strict=True)])
+        if joined:
+            actions[begins] = starts
         tables = np.concatenate([_basis_and_fit(self, length - joined, joined) for length in lengths.tolist()])
         basis, fit = tables[:, 0], tables[:, 1]
-        omega = np.add.reduceat(actions[:, :, None] * fit[:, None], starts).clip(-1.0, 1.0)
+        omega = np.add.reduceat(actions[:, :, None] * fit[:, None], begins).clip(-1.0, 1.0)
         fitted = np.einsum("tai,ti->ta", omega.repeat(lengths, axis=0), basis)
-        return omega[:, :, int(joined) :], np.maximum.reduceat(np.abs(fitted - actions), starts).max(axis=1)
+        return omega[:, :, int(joined) :], np.maximum.reduceat(np.abs(fitted - actions), begins).max(axis=1)
 
     def canonical(self, joined: bool = False) -> FloatArray:
         """What turns the weights of options into weights that play the same actions, the same for all that do.

@@ -3,7 +3,8 @@
 import argparse
 import sys
 import threading
-from collections.abc import Sequence
+import time
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -42,12 +43,18 @@ def _parser() -> argparse.ArgumentParser:
     commands = parser.add_subparsers(dest="command", required=True)
 
     run = commands.add_parser("run", help="make the runs that are missing", description="Make the runs that are missing.")
-    run.add_argument("--preset", required=True, help="smoke, quick, learning, paper, or a YAML file")
+    run.add_argument("--preset", required=True, help="one of the package's, such as smoke or quick, or a YAML file")
     run.add_argument("--folder", type=Path, help="where the runs go; runs/study/PRESET by default")
     run.add_argument("--workers", type=int, help="number of processes; one a core by default")
     run.add_argument("--engine", choices=("local", "ray"), default="local", help="processes of this machine, or Ray")
     run.add_argument("--address", help="of a running Ray cluster, such as auto; by default Ray is started here")
     run.add_argument("--skip-records", type=Path, metavar="CSV", help="skip the runs that a file of `collect` has")
+    run.add_argument(
+        "--hours",
+        type=float,
+        help="only what ends in so many hours, by the time that runs took; seed by seed, the cheap first",
+    )
+    run.add_argument("--costs", type=Path, nargs="+", default=[], metavar="CSV", help="for --hours: more files of `collect`")
     for name, kind in {"tasks": str, "rates": int, "algorithms": str, "settings": str}.items():
         run.add_argument(f"--{name}", nargs="+", type=kind, help=f"only these {name} of the preset")
     run.add_argument("--seeds", nargs="+", type=int, help="these in place of the preset's, which begin at 0")
@@ -63,8 +70,10 @@ def _parser() -> argparse.ArgumentParser:
     collect.set_defaults(call=_collect)
 
     plot = commands.add_parser("plot", help="figures and a table")
-    plot.add_argument("source", type=Path, help="a study's folder, or a file of `collect`")
+    plot.add_argument("sources", type=Path, nargs="+", metavar="source", help="a study's folder, or a file of `collect`")
     plot.add_argument("--output", type=Path, metavar="DIR", help="SOURCE/figures by default, or figures beside the file")
+    plot.add_argument("--algorithms", nargs="+", help="only these")
+    plot.add_argument("--settings", nargs="+", help="only these; best is the best action repeat")
     plot.set_defaults(call=_plot)
     return parser
 
@@ -78,6 +87,8 @@ def _run(args: argparse.Namespace) -> int:
 
     if args.workers is not None and args.workers < 1:
         raise ValueError(f"--workers must be at least 1, not {args.workers}")
+    if args.hours is not None and not (args.hours > 0 and args.engine == "local"):
+        raise ValueError(f"--hours must be positive and is for --engine local, not {args.hours} with {args.engine}")
     if args.address and args.engine != "ray":
         raise ValueError(f"--address {args.address} is Ray's: add --engine ray")
     preset = load_preset(args.preset)
@@ -95,7 +106,14 @@ def _run(args: argparse.Namespace) -> int:
     print(f"{len(runs) - len(left)} of {len(runs)} runs are complete in {folder}", flush=True)
 
     workers = args.workers or _cpu_count()
-    outcomes = run_local(left, folder, workers) if args.engine == "local" else run_on_ray(left, folder, workers, args.address)
+    may_begin = None
+    if args.hours is not None:
+        left, may_begin = _in_time(args, left, folder, workers)
+        runs = [run for run in runs if run in left or (folder / run.name / RECORD).exists()]
+    if args.engine == "ray":
+        outcomes = run_on_ray(left, folder, workers, args.address)
+    else:
+        outcomes = run_local(left, folder, workers, may_begin or (lambda run: True))
     states = set()
     with _Progress(folder, runs, workers):
         for outcome in outcomes:
@@ -105,6 +123,27 @@ def _run(args: argparse.Namespace) -> int:
             elif outcome.state == "busy":
                 _say(f"{outcome.name} is in the hands of another study")
     return FAILED if "failed" in states else BUSY if "busy" in states else COMPLETE
+
+
+def _in_time(
+    args: argparse.Namespace, left: "list[Run]", folder: Path, workers: int
+) -> "tuple[list[Run], Callable[[Run], bool]]":
+    """The runs that fit into ``--hours``, as is printed, and whether one still does when its turn comes."""
+    from sb3_ctco.study.records import read_records  # noqa: PLC0415
+    from sb3_ctco.study.runs import RECORD  # noqa: PLC0415
+    from sb3_ctco.study.schedule import costs, fit  # noqa: PLC0415
+    from sb3_ctco.study.status import clock  # noqa: PLC0415
+
+    files = [*args.costs, *([args.skip_records] if args.skip_records else [])]
+    sources = [read_records(source) for source in ([folder] if any(folder.glob(f"*/{RECORD}")) else []) + files]
+    cost = costs(left, *sources)
+    planned = fit(left, cost, workers, 3600 * args.hours)
+    computing = sum(cost[run.name] for _, run in planned) / 3600
+    print(f"{len(planned)} of {len(left)} runs fit into {args.hours:g} h on {workers} processes ({computing:.1f} h in all):")
+    for begin, run in planned:
+        print(f"  after {clock(begin)}: {run.name}, {clock(cost[run.name])}")
+    end = time.monotonic() + 3600 * args.hours
+    return [run for _, run in planned], lambda run: time.monotonic() + cost[run.name] <= end
 
 
 def _status(args: argparse.Namespace) -> int:
@@ -126,8 +165,9 @@ def _collect(args: argparse.Namespace) -> int:
 def _plot(args: argparse.Namespace) -> int:
     from sb3_ctco.study.plots import plot  # noqa: PLC0415
 
-    output = args.output or (args.source if args.source.is_dir() else args.source.parent) / "figures"
-    for file in plot(args.source, output):
+    first = args.sources[0]
+    output = args.output or (first if first.is_dir() else first.parent) / "figures"
+    for file in plot(args.sources, output, args.algorithms, args.settings):
         print(file)
     return COMPLETE
 

@@ -6,7 +6,7 @@ import multiprocessing
 import os
 import threading
 from collections import Counter, deque
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from multiprocessing.connection import Connection, wait
 from multiprocessing.process import BaseProcess
 from pathlib import Path
@@ -22,7 +22,9 @@ RETRIES = 3
 _THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMEXPR_NUM_THREADS", "VECLIB_MAXIMUM_THREADS")
 
 
-def run_local(runs: Sequence[Run], folder: Path, workers: int) -> Iterator[Outcome]:
+def run_local(
+    runs: Sequence[Run], folder: Path, workers: int, may_begin: Callable[[Run], bool] = lambda run: True
+) -> Iterator[Outcome]:
     """Make runs in processes of this machine, one a worker with one thread.
 
     They are connected by pipes alone, so that no semaphore and no shared memory outlives a study that was killed, and they
@@ -32,6 +34,7 @@ def run_local(runs: Sequence[Run], folder: Path, workers: int) -> Iterator[Outco
     :param runs: the runs, planned in the folder
     :param folder: the study's
     :param workers: number of processes
+    :param may_begin: asked of each run when a process is free for it; one that may not is left out
     :return: what became of each run, in the order in which they end
     """
     waiting, deaths, seen_busy = deque(runs), Counter[str](), set[str]()
@@ -40,11 +43,14 @@ def run_local(runs: Sequence[Run], folder: Path, workers: int) -> Iterator[Outco
     try:
         while waiting or at_work:
             while waiting and len(at_work) < workers:
+                run = waiting.popleft()
+                if not may_begin(run):
+                    continue
                 connection, process = idle.pop() if idle else _start_worker(folder)
-                at_work[connection] = process, waiting.popleft()
+                at_work[connection] = process, run
                 with contextlib.suppress(BrokenPipeError):  # it has died, as is found below
-                    connection.send(at_work[connection][1])
-            for ready in wait(list(at_work)):
+                    connection.send(run)
+            for ready in wait(list(at_work)) if at_work else ():
                 assert isinstance(ready, Connection)
                 connection = ready
                 process, run = at_work.pop(connection)

@@ -1,8 +1,9 @@
 """Figures and tables of a study's records."""
 
+import contextlib
 import math
 from collections import Counter, defaultdict
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -38,6 +39,15 @@ def mean_and_interval(values: Sequence[float]) -> tuple[float, float]:
     n = len(values)
     half_width = float(t.ppf(0.975, n - 1)) * float(np.std(values, ddof=1)) / math.sqrt(n) if n > 1 else math.nan
     return float(np.mean(values)), half_width
+
+
+@contextlib.contextmanager
+def repeatable() -> Iterator[None]:
+    """The same intervals each time: rliable draws from NumPy's global generator."""
+    state = np.random.get_state()
+    np.random.seed(0)
+    yield
+    np.random.set_state(state)
 
 
 def by_line(records: Sequence[Record], task: str, metric: str) -> dict[Line, dict[int, list[float]]]:
@@ -84,12 +94,10 @@ def interquartile_means(records: Sequence[Record], metric: str) -> Estimates:
             scores = scores * DEFAULT_DISCOUNT_RATE
             low = high = math.nan
             if len(complete) > 1:
-                state = np.random.get_state()
-                np.random.seed(0)  # rliable draws from the global generator.
-                _, interval = get_interval_estimates(
-                    {"": scores}, lambda x: np.array([aggregate_iqm(x)]), reps=_BOOTSTRAP_REPETITIONS
-                )
-                np.random.set_state(state)
+                with repeatable():
+                    _, interval = get_interval_estimates(
+                        {"": scores}, lambda x: np.array([aggregate_iqm(x)]), reps=_BOOTSTRAP_REPETITIONS
+                    )
                 low, high = (float(bound) for bound in interval[""][:, 0])
             estimates.setdefault(line, {})[rate] = (float(aggregate_iqm(scores)), low, high)
     return estimates
@@ -110,7 +118,7 @@ def draw_metric(records: Sequence[Record], metric: str) -> "Figure":
                 if len(values) > 1:
                     ax.plot([x] * len(values), values, ".", color=ALGORITHMS[line[0]].colour, markersize=3)
                 shown += values
-        for algorithm in ALGORITHMS:
+        for algorithm in dict(lines):
             if numbers := paper.get((task, algorithm)):
                 shown += numbers.values()
                 label = f"{ALGORITHMS[algorithm].label}, the paper's figure"
@@ -239,30 +247,50 @@ def table(records: Sequence[Record], estimates: dict[str, Estimates]) -> str:
     return "\n".join(parts) + "\n"
 
 
-def plot(source: Path, output: Path) -> list[Path]:
-    """Draw everything that a study's folder, or a CSV file of its records, has the data for.
+def plot(
+    sources: Sequence[Path], output: Path, algorithms: Sequence[str] | None = None, settings: Sequence[str] | None = None
+) -> list[Path]:
+    """Draw everything that studies' folders, or CSV files of their records, have the data for.
 
-    :param source: the folder or file; the learning curves of a file are in the one beside it
+    :param sources: folders or files; the learning curves of a file are in the one beside it
     :param output: folder for figures (PNG and SVG) and ``table.md``
+    :param algorithms: only these; all by default
+    :param settings: likewise; ``best`` is the best action repeat
     :return: the files written
+    :raises ValueError: if nothing is left
     """
     import matplotlib as mpl  # noqa: PLC0415
 
     mpl.use("Agg")
     import matplotlib.pyplot as plt  # noqa: PLC0415
 
+    from sb3_ctco.study import scores  # noqa: PLC0415
+
+    by = list(algorithms or ALGORITHMS)
+
+    def chosen(rows: Sequence[Record]) -> list[Record]:
+        return [row for row in rows if row["algorithm"] in by and (settings is None or row["setting"] in settings)]
+
     # Text as text, and the same bytes for the same records.
     mpl.rcParams.update({"svg.fonttype": "none", "svg.hashsalt": "sb3-ctco"})
-    records = read_records(source)
+    everything = [record for source in sources for record in read_records(source)]
+    records = chosen(scores.with_equal_repeats(everything))
+    if not records:
+        raise ValueError(f"no record has an algorithm of {algorithms} and a setting of {settings}: {lines_of(everything)}")
     output.mkdir(parents=True, exist_ok=True)
     estimates = {metric: interquartile_means(records, metric) for metric in ("discounted_return", "greedy_return")}
+    relative = scores.relative_scores(records, "discounted_return")
     figures = {
         "frequency": draw_metric(records, "discounted_return"),
         "frequency_greedy": draw_metric(records, "greedy_return"),
         "decision_rates": draw_metric(records, "decision_rate_hz"),
         "interquartile_means": draw_interquartile_means(records, estimates),
+        "pareto": scores.draw_pareto([row for row in everything if row["algorithm"] in by], "discounted_return"),
     }
-    if points := read_curves(source):
+    if relative:
+        figures["profiles"] = scores.draw_profiles(records, relative)
+        figures["improvement"] = scores.draw_improvement(records, relative)
+    if points := chosen([point for source in sources for point in read_curves(source)]):
         figures["learning_curves"] = draw_learning_curves(points)
     written = []
     for name, figure in figures.items():
@@ -271,7 +299,7 @@ def plot(source: Path, output: Path) -> list[Path]:
             figure.savefig(written[-1], dpi=120, metadata=metadata)
         plt.close(figure)
     written.append(output / "table.md")
-    written[-1].write_text(table(records, estimates), encoding="utf-8")
+    written[-1].write_text(table(records, estimates) + scores.averaged_table(relative), encoding="utf-8")
     return written
 
 

@@ -77,7 +77,7 @@ class Status:
             parts.append(f"{len(failed)} failed")
         workers = len(running) if workers is None else workers
         if workers and (running or self.of("waiting")):
-            parts.append(f"{_clock(self.seconds_left(workers))} left")
+            parts.append(f"{clock(self.seconds_left(workers))} left")
         return ", ".join(parts)
 
     def details(self) -> list[str]:
@@ -134,7 +134,8 @@ def _progress(path: Path, settings: dict[str, Any]) -> tuple[float, float, float
     )
 
 
-def _clock(seconds: float) -> str:
+def clock(seconds: float) -> str:
+    """Seconds in words."""
     if math.isnan(seconds):
         return "unknown time"
     minutes = math.ceil(seconds / 60)
