@@ -26,7 +26,7 @@ class Safety:
         velocities, ``"hold"``, the last action once more, which stops one that is commanded by positions, or a function
     :param max_rate: the largest change of an action, in widths of its box a second; None for no limit
     :param max_slew: the largest change of that rate, in widths a second, a second; None for no limit. It slows down in time
-        to come to rest at what is commanded, so it follows moving commands a little late
+        to come to rest at what is commanded, so it follows commands a little late that move faster than it stops in a period
     :raises ValueError: if a number is not positive, or ``safe_action`` is neither a function nor one of its names
     """
 
@@ -122,8 +122,9 @@ class Guard:
             rate = rate.clip(-max_rate, max_rate)
         if max_slew is not None:
             step = max_slew * seconds
-            # The fastest that, after this period, can still be braked before the end of the gap: v·dt + v²/(2s) = gap
-            brakes = np.sqrt(step * step + 2.0 * max_slew * np.abs(gap)) - step
+            # The fastest that, after this period, can still be braked before the end of the gap, v·dt + v²/(2s) = gap; or, at
+            # its end, in one period.
+            brakes = np.maximum(np.sqrt(step * step + 2.0 * max_slew * np.abs(gap)) - step, step)
             rate = rate.clip(-brakes, brakes).clip(self._rate - step, self._rate + step)
         self._rate = rate
         return (self._sent + rate * seconds * self._width).clip(self.low, self.high)

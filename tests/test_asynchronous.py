@@ -28,7 +28,8 @@ from sb3_ctco import CTCO, FiGARSAC, OptionExecutionWrapper
 from sb3_ctco.realtime import AsynchronousTrainer, JournalError, JournalReader, LearnerError, Transition
 from sb3_ctco.realtime import trainer as trainer_module
 from sb3_ctco.realtime.weights import SharedWeights
-from sb3_ctco.wrappers import RealTimeOptionWrapper
+from sb3_ctco.safety import Safety
+from sb3_ctco.wrappers import RealTimeOptionWrapper, RealTimeWrapper
 
 # Processes that start and stop
 pytestmark = pytest.mark.slow
@@ -851,3 +852,99 @@ def test_acting_priority_is_in_force_while_acting(tmp_path):
     assert os.sched_getscheduler(0) == before
     with pytest.raises(ValueError, match="from 1 to 99, not 0"):
         AsynchronousTrainer(model, env, tmp_path / "other", acting_priority=0)
+
+
+def lead(obs):
+    """Somebody who leads the point to where it is paid for, in the second half of each episode."""
+    return [np.clip(2.0 * (0.3 - obs[0]), -1.0, 1.0)] if obs[1] >= 0.5 else None
+
+
+def test_demonstrations_and_what_is_taken_over_reach_the_learner(tmp_path):
+    env = Point()
+    model = make_model(CTCO, env, d_max=0.2)
+    with AsynchronousTrainer(model, env, tmp_path, real_time=False, updates_per_second=500, take_over=lead) as trainer:
+        observations = np.stack([0.3 * np.ones(31), 0.02 * np.arange(31)], axis=1).astype(np.float32)
+        with pytest.raises(ValueError, match="n actions, n rewards"):
+            trainer.add_trajectory(observations, np.zeros((20, 1)), np.zeros(20), True, False, 0.02)
+        added = trainer.add_trajectory(observations, np.zeros((30, 1)), np.zeros(30), False, True, 0.02)
+        assert added.added > 20
+        trainer.learn(150)
+        assert model.replay_buffer.n_demonstrations == 0
+        trainer.restore_replay_buffer()
+        with pytest.raises(ValueError, match="add_trajectory of AsynchronousTrainer"):
+            AsynchronousTrainer(model, env, tmp_path / "other")
+    buffer = model.replay_buffer
+    # What it was shown, and the second halves of three episodes of 50 steps
+    assert added.added + 3 * 20 < buffer.n_demonstrations < added.added + 3 * 25 + 1
+    rows = slice(buffer.buffer_size - buffer.n_demonstrations, None)
+    led = buffer.observations[rows, 0]
+    assert ((led[:, 0] == np.float32(0.3)) | (led[:, 1] >= 0.5)).all()
+    # The policy's own are the first halves, each up to where somebody took over
+    assert (buffer.observations[: buffer.pos, 0, 1] < 0.5).all()
+    assert buffer.next_observations[: buffer.pos, 0, 1].max() == pytest.approx(0.5)
+
+    again = make_model(CTCO, env, d_max=0.2)
+    with AsynchronousTrainer(again, env, tmp_path, resume=True, real_time=False, take_over=lead) as trainer:
+        trainer.restore_replay_buffer()
+    assert abs(again.replay_buffer.n_demonstrations - buffer.n_demonstrations) < 10
+
+
+def test_take_over_is_for_options(tmp_path):
+    env = Point()
+    with pytest.raises(ValueError, match="take_over are for algorithms with options, which SAC is not"):
+        AsynchronousTrainer(make_model(SAC, env), env, tmp_path, take_over=lead)
+    with pytest.raises(TypeError, match="take_over must be a function or None, not 3"):
+        AsynchronousTrainer(make_model(CTCO, env), env, tmp_path, take_over=3)
+
+
+class Machine(Point):
+    """The same as a machine that takes commands and is read later."""
+
+    def send(self, action):
+        self.commands.append(float(action[0]))
+
+    def receive(self):
+        self.x += self.dt * self.commands[-1]
+        self.steps += 1
+        return self._obs(), -abs(self.x - 0.3), False, False, {}
+
+    def step(self, action):
+        raise AssertionError("a machine is commanded by send and read by receive")
+
+
+@pytest.mark.parametrize("algorithm", [SAC, CTCO])
+def test_a_machine_without_a_learner_is_held_until_its_option_is_broken_off(tmp_path, algorithm, caplog):
+    class KillLearner(BaseCallback):
+        def _on_step(self):
+            if self.n_calls == 20:
+                multiprocessing.active_children()[0].kill()
+            return True
+
+    machine = Machine()
+    safety = Safety(safe_action=lambda sent: [0.125], max_rate=None, max_slew=None)
+    env = gym.wrappers.TimeLimit(RealTimeWrapper(machine, safety=safety), 1000)
+    model = make_model(algorithm, env)
+    trainer = AsynchronousTrainer(model, env, tmp_path)
+    with trainer, pytest.raises(LearnerError, match="killed by signal SIGKILL"):
+        trainer.learn(5000, KillLearner())
+    assert machine.commands[-2:] == [0.125, 0.0]  # the safe action, and then the safe stop
+    assert trainer.real_time.total_statistics.safe_ticks == 1
+    assert "the safe action is sent (the learner was killed by signal SIGKILL)" in caplog.text
+
+
+def test_a_policy_that_diverges_stops_nothing(tmp_path):
+    machine = Machine()
+    env = gym.wrappers.TimeLimit(machine, 30)  # the period is held inside
+    model = make_model(CTCO, env, d_max=0.1)
+    model.learning_starts = 0
+    with th.no_grad():
+        for parameter in model.actor.parameters():
+            parameter.fill_(th.nan)
+    trainer = AsynchronousTrainer(model, env, tmp_path)
+    trainer._settings["updates_per_second"] = 1e-3
+    with trainer:
+        trainer.learn(40)
+    assert trainer.real_time.env is machine
+    assert trainer.real_time.total_statistics.safe_ticks == 40
+    assert set(machine.commands) == {0.0}
+    assert records_of(tmp_path) == []

@@ -209,20 +209,20 @@ def test_limits_hold_by_a_clock_and_not_at_a_fixed_rate():
 
 
 def peak_of_memory(function, obs):
-    """Of 80 calls, in bytes."""
-    tracemalloc.start()
-    try:
-        for _ in range(80):
+    """Of 40 calls, in bytes; the least of two times, because the interpreter has its own needs now and then."""
+    peaks = []
+    for _ in range(2):
+        tracemalloc.start()
+        for _ in range(40):
             function(obs)
-        return tracemalloc.get_traced_memory()[1]
-    finally:
+        peaks.append(tracemalloc.get_traced_memory()[1])
         tracemalloc.stop()
+    return min(peaks)
 
 
-@pytest.mark.parametrize("join", ["free", "continuous"])
 @pytest.mark.parametrize("n", [None, 3])
-def test_between_decisions_nothing_is_allocated_and_an_action_may_be_kept(n, join):
-    policy = JoinedPolicy() if join == "continuous" else Policy()
+def test_between_decisions_nothing_is_allocated_and_an_action_may_be_kept(n):
+    policy = Policy()
     controller = OptionController(policy, dt=0.004)  # 100 ticks an option
     obs = np.zeros(3) if n is None else np.zeros((n, 3))
     kept = [controller(obs) for _ in range(10)]
@@ -238,87 +238,10 @@ def test_between_decisions_nothing_is_allocated_and_an_action_may_be_kept(n, joi
     np.testing.assert_array_equal(kept, copies)
 
 
-def test_checks_and_replanning_between_decisions():
-    """Where there is a check, the actions of the ticks before it are read from memory, and those after it."""
-    policy, interrupt = JoinedPolicy(), Interrupt()
-    policy.value = 1.0
-    controller = OptionController(policy, dt=0.004, replan_period=0.3, interrupt=interrupt)
-    obs = np.zeros(1)
-    sent = [float(controller(obs)[0]) for _ in range(200)]
-    # 75 ticks of each plan of 100 are played, a hundredth of the way with each one, from where it is.
-    steps = np.arange(1, 76) / 100
-    expected = np.concatenate([steps, 0.75 + 0.25 * steps, 0.9375 + 0.0625 * steps])[:200]
-    np.testing.assert_allclose(sent, expected, atol=1e-6)
-    assert len(policy.asked) == 3
-    # After 50 ticks of each
-    assert len(interrupt.asked) == 2
-    seen, rests = interrupt.asked[0]
-    np.testing.assert_allclose(seen, [[0.0, 0.5]], atol=1e-6)
-    np.testing.assert_allclose(rests[0, 0], 1.0, atol=1e-6)
-    np.testing.assert_allclose(policy.asked[1], [0.0, 0.75], atol=1e-6)
-
-
-# --- with continuous joins
-
-
-class JoinedPolicy(Policy):
-    """Options of 0.4 s that go from what is being sent to ``value``, in a straight line."""
-
-    option_space = OptionSpace.make(n_rbf=1, d_max=0.4, d_min=0.1, dt=0.1, discount_rate=0.4, join="continuous")
-    primitive_action_space = spaces.Box(-1.0, 1.0, (1,))
-    observation_space = spaces.Box(-np.inf, np.inf, (2,))
-
-    def __call__(self, observation):
-        self.asked.append(observation)
-        if isinstance(self.value, Exception):
-            raise self.value
-        option = np.array([self.value, 1.0], np.float32)
-        return option if np.ndim(observation) == 1 else np.tile(option, (len(observation), 1))
-
-
-@pytest.mark.parametrize("n", [None, 2])
-def test_an_option_leaves_from_what_a_limit_let_through(n):
-    """A rate of 1/s lets through 0.2 in 0.1 s, and the policy wants 0.25."""
-    policy = JoinedPolicy()
-    policy.value = 1.0
-    controller = OptionController(policy, safety=Safety(max_rate=1.0, max_slew=None))
-    obs = np.zeros(1) if n is None else np.zeros((n, 1))
-    sent = np.array([np.ravel(controller(obs, now=0.1 * k))[-1] for k in range(6)])
-    np.testing.assert_allclose(sent, [0.25, 0.45, 0.65, 0.85, 0.8875, 0.925], atol=1e-6)
-    np.testing.assert_allclose(np.atleast_2d(policy.asked[1])[-1], [0.0, 0.85], atol=1e-6)
-
-
-@pytest.mark.parametrize("n", [None, 2])
-def test_an_option_leaves_from_the_safe_action(n):
-    policy = JoinedPolicy()
-    policy.value = 1.0
-    controller = OptionController(policy, safety=Safety(safe_action=lambda sent: sent - 0.25, stale_after=0.15, **UNLIMITED))
-    obs = np.zeros(1) if n is None else np.zeros((n, 1))
-    seen = [obs, obs, None, None, obs, obs]
-    sent = np.array([np.ravel(controller(one, now=0.1 * k))[-1] for k, one in enumerate(seen)])
-    # The fourth tick has an observation of 0.2 s; from its action the next option goes to 1.
-    np.testing.assert_allclose(sent, [0.25, 0.5, 0.75, 0.5, 0.625, 0.75], atol=1e-6)
-    np.testing.assert_allclose(np.atleast_2d(policy.asked[-1])[-1], [0.0, 0.5], atol=1e-6)
-
-
-def test_limits_begin_with_what_is_being_sent():
-    _, controller = make_controller(max_rate=1.0)
-    controller.reset(last_action=[-1.0, 0.0])
-    np.testing.assert_allclose(controller(np.zeros(3), now=0.0), [-0.8, 0.4], atol=1e-6)
-
-
-def test_a_check_tells_the_rest_from_what_was_sent():
-    policy, interrupt = JoinedPolicy(), Interrupt()
-    policy.value, interrupt.answer = 1.0, True
-    controller = OptionController(policy, interrupt=interrupt, safety=Safety(max_rate=1.0, max_slew=None))
-    sent = [float(controller(np.zeros(1), now=0.1 * k)[0]) for k in range(3)]
-    # After two steps: of what was sent, 0.45, and not of the 0.5 that was wanted
-    np.testing.assert_allclose(interrupt.asked[0][0], [[0.0, 0.45]], atol=1e-6)
-    np.testing.assert_allclose(policy.asked[1], [0.0, 0.45], atol=1e-6)
-    np.testing.assert_allclose(sent, [0.25, 0.45, 0.45 + 0.55 / 4], atol=1e-6)
-    # Without a new observation nothing is asked.
-    controller(None, now=0.3)
-    assert len(interrupt.asked) == 1
+def test_smooth_commands_pass_as_they_are():
+    """At 50 Hz, up to 8 widths a second: what can be stopped within a period."""
+    targets = np.stack([np.sin(np.arange(50) * 0.1), 2 + 2 * np.cos(np.arange(50) * 0.1)], axis=1).astype(np.float32)
+    np.testing.assert_allclose(commands(Safety(), targets), targets, atol=1e-6)
 
 
 class Clock:

@@ -137,6 +137,7 @@ class RealTimeWrapper(gym.Wrapper, RecordConstructorArgs):
         #: Why the safe action is to be sent, whatever is decided; None if it is not. For whoever watches the loop
         self.alarm: str | None = None
         self._observation_age = 0.0
+        self._sent_at: float | None = None
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
         """Reset the environment; the clock starts with the first command."""
@@ -144,7 +145,7 @@ class RealTimeWrapper(gym.Wrapper, RecordConstructorArgs):
         self.statistics = TickStatistics()
         self._due = None
         obs, info = reset_env(self.env, seed, options)
-        self._observation_age = 0.0
+        self._observation_age, self._sent_at = 0.0, None
         if self.guard is not None:
             self.guard.start(info.get(LAST_ACTION))
         return obs, info
@@ -164,7 +165,9 @@ class RealTimeWrapper(gym.Wrapper, RecordConstructorArgs):
 
         replaced = False
         if self.guard is not None:
-            action = self.guard.command(action, self.dt, self._observation_age, self.alarm)
+            seconds = self.dt if self._sent_at is None else min(now - self._sent_at, self.dt)
+            self._sent_at = now
+            action = self.guard.command(action, seconds, self._observation_age, self.alarm)
             replaced = self.guard.is_safe_action
             self.statistics.safe_ticks += replaced
             self.total_statistics.safe_ticks += replaced

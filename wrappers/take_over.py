@@ -61,7 +61,8 @@ class TakeOverWrapper(gym.Wrapper, RecordConstructorArgs):
         if other is not None:
             self._observations = self._observations or [self._last_obs]
             self._observations.append(deepcopy(obs))
-            self._actions.append(other)
+            # A guard inside may have sent another one.
+            self._actions.append(info.get(LAST_ACTION, other))
             self._rewards.append(float(reward))
             # Whatever is inside, such as a guard, knows better what was sent.
             info = {LAST_ACTION: other, **info, TAKEN_OVER: True}

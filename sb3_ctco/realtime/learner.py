@@ -2,6 +2,7 @@
 
 import contextlib
 import dataclasses
+import logging
 import multiprocessing
 import os
 import signal
@@ -21,6 +22,8 @@ from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from sb3_ctco.options import SubOptions
 from sb3_ctco.realtime.journal import Arrays, JournalError, JournalReader
 from sb3_ctco.realtime.weights import SharedWeights
+
+logger = logging.getLogger(__name__)
 
 #: An update's share of a round is kept below this, so that a round can be stopped in time; in s
 _ROUND_SECONDS = 0.1
@@ -151,7 +154,7 @@ class _Learner:
         self.model = settings.algorithm.load(settings.start, device=settings.device)
         self.model._total_timesteps = settings.total_timesteps
         self.model.set_logger(Logger(folder=None, output_formats=[]))
-        self.journal = JournalReader(settings.folder / "journal")
+        self.journals = [JournalReader(settings.folder / name) for name in ("journal", "demonstrations")]
         self.num_updates = 0
 
     def run(self) -> None:
@@ -166,8 +169,7 @@ class _Learner:
         logged_at = saved_at = time.monotonic()
         updates_logged = 0
         while not self.stop.value and parent.is_alive():
-            n_read = fill_replay_buffer(model, self.journal, 1000)
-            if n_read == 1000:
+            if max(fill_replay_buffer(model, journal, 1000) for journal in self.journals) == 1000:
                 continue  # learning waits until all that was collected before is read
             now = time.monotonic()
             ready = model.num_timesteps > model.learning_starts and model.replay_buffer.size() > 0
@@ -193,7 +195,7 @@ class _Learner:
                 self.save()
                 saved_at = now
         # So that the checkpoint says how far acting got.
-        while fill_replay_buffer(model, self.journal, 1000):
+        while fill_replay_buffer(model, self.journals[0], 1000):
             pass
 
     def save(self) -> None:
@@ -208,13 +210,20 @@ class _Learner:
 
 
 def fill_replay_buffer(model: OffPolicyAlgorithm, journal: JournalReader, max_records: int) -> int:
-    """Move transitions from a journal to a model's replay buffer.
+    """Move transitions, and recorded trajectories, from a journal to a model's replay buffer.
 
     :return: how many
     """
     assert model.replay_buffer is not None
     records = journal.read(max_records)
     for record in records:
+        if "dt" in record:
+            try:
+                model.replay_buffer.add_trajectory(**{**record, "dt": float(record["dt"])})  # type: ignore[attr-defined]
+            except ValueError as error:
+                # What somebody did must not stop the machine.
+                logger.warning("a demonstration was left out: %s", error)
+            continue
         transition = Transition.from_arrays(record)
         model.replay_buffer.add(*transition[:-1])  # type: ignore[arg-type]
         model.num_timesteps = transition.num_timesteps

@@ -30,7 +30,9 @@ from stable_baselines3.common.utils import get_device
 from stable_baselines3.common.vec_env import VecEnv, VecEnvWrapper
 from stable_baselines3.common.vec_env.base_vec_env import VecEnvObs, VecEnvStepReturn
 
+from sb3_ctco.common.buffers import AddedTrajectory
 from sb3_ctco.common.option_algorithm import OptionOffPolicyAlgorithm
+from sb3_ctco.datasets import RecordedTrajectory
 from sb3_ctco.options import ValueInterrupt
 from sb3_ctco.realtime.journal import JournalReader, JournalWriter, check_meaning, repair_journal, segments
 from sb3_ctco.realtime.learner import (
@@ -48,7 +50,10 @@ from sb3_ctco.wrappers import (
     RealTimeOptionWrapper,
     RealTimeWrapper,
     SupportsSendReceive,
+    TakeOver,
+    TakeOverWrapper,
 )
+from sb3_ctco.wrappers.take_over import TAKEN_OVER
 
 logger = logging.getLogger(__name__)
 
@@ -116,9 +121,11 @@ class AsynchronousTrainer(Generic[AlgorithmType]):
         ordinary process delays; needs root or CAP_SYS_NICE. None leaves it to the ordinary scheduler
     :param checkpoint_seconds: between two checkpoints of the learner; ``math.inf`` for one at the end alone
     :param decide_ahead: decide on the next option this many seconds before the current one ends, see
-        :class:`~sb3_ctco.wrappers.RealTimeOptionWrapper`; for algorithms with options. With this or ``interrupt`` there are
-        no sub-options: the model's ``n_sub_options`` becomes 0
+        :class:`~sb3_ctco.wrappers.RealTimeOptionWrapper`; for algorithms with options
     :param interrupt: ends an option early, see there; for algorithms with options
+    :param take_over: called with each observation; returns the action to send in place of the policy's, or None, see
+        :class:`~sb3_ctco.wrappers.TakeOverWrapper`. What is done so becomes demonstrations, and no transitions of the policy;
+        for algorithms with options
     :raises ValueError: for an environment, a model or settings that cannot be right, and for ``resume`` if what is in
         ``folder`` was collected with other settings or cannot be read
     :raises TypeError: if ``safe_stop`` or ``interrupt`` is no function
@@ -142,9 +149,10 @@ class AsynchronousTrainer(Generic[AlgorithmType]):
         checkpoint_seconds: float = 60.0,
         decide_ahead: float = 0.0,
         interrupt: Interrupt | None = None,
+        take_over: TakeOver | None = None,
     ):
         _check_model_and_env(model, env)
-        _check_functions(safe_stop=safe_stop, interrupt=interrupt)
+        _check_functions(safe_stop, interrupt=interrupt, take_over=take_over)
         _check_numbers(
             updates_per_second=updates_per_second,
             learner_threads=learner_threads,
@@ -154,13 +162,22 @@ class AsynchronousTrainer(Generic[AlgorithmType]):
             decide_ahead=decide_ahead,
         )
         _check_device(learner_device)
-        reactive = decide_ahead > 0 or interrupt is not None
+        reactive = decide_ahead > 0 or interrupt is not None or take_over is not None
         if reactive and not isinstance(model, OptionOffPolicyAlgorithm):
             raise ValueError(
-                f"decide_ahead and interrupt are for algorithms with options, which {type(model).__name__} is not"
+                f"decide_ahead, interrupt and take_over are for algorithms with options, which {type(model).__name__} is not"
+            )
+        if getattr(model.replay_buffer, "n_demonstrations", 0):
+            raise ValueError(
+                "the learner has a replay buffer of its own, and the demonstrations are in the model's: add them with "
+                "add_trajectory of AsynchronousTrainer"
             )
         self.folder = Path(folder)
         self._journal_folder = self.folder / "journal"
+        # Apart from the journal, whose oldest files are deleted.
+        self._demonstration_folder = self.folder / "demonstrations"
+        self._demonstrations: JournalWriter | None = None
+        self._take_over: TakeOverWrapper | None = None
         if self._journal_folder.exists() and not resume:
             raise FileExistsError(
                 f"{self.folder} holds the experience of an earlier run: pass resume=True to continue it, or another folder"
@@ -173,14 +190,14 @@ class AsynchronousTrainer(Generic[AlgorithmType]):
         #: Counts late ticks; None without ``real_time``
         self.real_time: RealTimeWrapper | None = None
         if real_time:
-            found = unwrap_wrapper(env, RealTimeWrapper)
-            env = RealTimeWrapper(env) if found is None else env
-            self.real_time = env if found is None else found  # type: ignore[assignment]
+            env, self.real_time = _hold_period(env)
         self._supervisor = _Supervisor(env)
         wrapped: gym.Env = self._supervisor
-        if reactive:
+        if take_over is not None:
+            wrapped = self._take_over = TakeOverWrapper(wrapped, take_over, self._keep_demonstration)
+        # In real time also without any of that, so that a watchdog ends an option.
+        if reactive or (real_time and isinstance(model, OptionOffPolicyAlgorithm)):
             assert isinstance(model, OptionOffPolicyAlgorithm)
-            model.n_sub_options = 0  # type: ignore[attr-defined]
             wrapped = RealTimeOptionWrapper.like(
                 model.wrap_env(wrapped), decide_ahead=decide_ahead, interrupt=interrupt, background=real_time
             )
@@ -201,6 +218,7 @@ class AsynchronousTrainer(Generic[AlgorithmType]):
         if resume:
             check_meaning(self._journal_folder, _meaning(model))
             repair_journal(self._journal_folder)
+            repair_journal(self._demonstration_folder)
             self._load_checkpoint()
             self._count_timesteps()
 
@@ -237,6 +255,7 @@ class AsynchronousTrainer(Generic[AlgorithmType]):
         assert model.replay_buffer is not None
         # What a replay buffer of this size has forgotten, no other one would learn from.
         journal = JournalWriter(self._journal_folder, _meaning(model), keep=model.replay_buffer.buffer_size)
+        self._demonstrations = JournalWriter(self._demonstration_folder, _meaning(model))
         start = self.folder / "start.zip"
         model.save(start)
         settings = LearnerSettings(type(model), start, self.folder, total_timesteps, **self._settings)
@@ -249,7 +268,7 @@ class AsynchronousTrainer(Generic[AlgorithmType]):
         try:
             with _sigterm_as_exit():
                 link.wait_until_ready()
-                self._supervisor.check = link.check
+                self._supervisor.check = lambda: self._look_at(link)
                 with _prompt_threads(), _scheduled(self.acting_priority):
                     self._act(in_between, journal, remaining, callbacks, log_interval, tb_log_name, progress_bar)
         finally:
@@ -259,6 +278,7 @@ class AsynchronousTrainer(Generic[AlgorithmType]):
             finally:
                 try:
                     journal.close()
+                    self._demonstrations.close()
                 finally:
                     stop.value = True
                     link.join()
@@ -298,17 +318,60 @@ class AsynchronousTrainer(Generic[AlgorithmType]):
                 break
         callback.on_training_end()
 
+    def add_trajectory(
+        self,
+        observations: Any,
+        actions: np.ndarray,
+        rewards: np.ndarray,
+        terminated: bool,
+        truncated: bool,
+        dt: float,
+    ) -> AddedTrajectory:
+        """Have the learner learn from a recorded trajectory, too, see :meth:`OptionReplayBuffer.add_trajectory`.
+
+        It is kept in ``folder/demonstrations``. For use before learning; what is recorded meanwhile is ``take_over``'s.
+
+        :return: what becomes of it
+        :raises ValueError: if it cannot be right, see there, or the model's algorithm is none with options
+        """
+        if not isinstance(self.model, OptionOffPolicyAlgorithm):
+            raise ValueError(f"demonstrations become options, for which {type(self.model).__name__} has no use")
+        trajectory = RecordedTrajectory(observations, actions, rewards, terminated, truncated, dt)
+        buffer: Any = self.model.replay_buffer
+        added = buffer.add_trajectory(*trajectory)
+        buffer.n_demonstrations = 0  # The learner's has them; here they were looked at.
+        self._demonstrations = JournalWriter(self._demonstration_folder, _meaning(self.model))
+        self._keep_demonstration(trajectory)
+        self._demonstrations.close()
+        return added
+
+    def _keep_demonstration(self, trajectory: RecordedTrajectory) -> None:
+        assert self._demonstrations is not None
+        self._demonstrations.add(trajectory._asdict())
+
     def restore_replay_buffer(self) -> None:
         """Fill the model's own replay buffer with everything that was collected, for instance to learn on in place."""
-        journal = JournalReader(self._journal_folder)
-        while fill_replay_buffer(self.model, journal, 1000):
-            pass
-        journal.close()
+        for folder in filter(segments, (self._demonstration_folder, self._journal_folder)):
+            journal = JournalReader(folder)
+            while fill_replay_buffer(self.model, journal, 1000):
+                pass
+            journal.close()
+
+    def _look_at(self, link: "_Link") -> None:
+        """See whether the learner is alive. Where commands are guarded it is no error here, within a tick."""
+        try:
+            link.check()
+        except LearnerError as error:
+            if self.real_time is None or self.real_time.guard is None:
+                raise
+            self.real_time.alarm = str(error).splitlines()[0]
 
     def _make_safe(self) -> None:
         option_env = unwrap_wrapper(self.model.env.envs[0], RealTimeOptionWrapper)  # type: ignore[union-attr]
         if isinstance(option_env, RealTimeOptionWrapper):
             option_env.abandon()
+        if self._take_over is not None:
+            self._take_over.hand_over()
         if self._supervisor.has_commanded:
             self.safe_stop(self.bare_env)
 
@@ -342,6 +405,21 @@ class AsynchronousTrainer(Generic[AlgorithmType]):
         journal.close()
 
 
+def _hold_period(env: gym.Env) -> tuple[gym.Env, RealTimeWrapper]:
+    """An environment with a RealTimeWrapper, and that one: directly around a machine, whose step has two halves."""
+    found = unwrap_wrapper(env, RealTimeWrapper)
+    if isinstance(found, RealTimeWrapper):
+        return env, found
+    if env is env.unwrapped or not isinstance(env.unwrapped, SupportsSendReceive):
+        real_time = RealTimeWrapper(env)
+        return real_time, real_time
+    innermost: Any = env
+    while innermost.env is not env.unwrapped:
+        innermost = innermost.env
+    innermost.env = RealTimeWrapper(env.unwrapped)
+    return env, innermost.env
+
+
 def _check_model_and_env(model: Any, env: Any) -> None:
     if not isinstance(model, OffPolicyAlgorithm):
         raise ValueError(f"AsynchronousTrainer needs an off-policy algorithm such as CTCO or SAC, not {type(model).__name__}")
@@ -356,16 +434,17 @@ def _check_model_and_env(model: Any, env: Any) -> None:
         )
 
 
-def _check_functions(safe_stop: Any, interrupt: Any) -> None:
+def _check_functions(safe_stop: Any, **others: Any) -> None:
     if not callable(safe_stop):
         raise TypeError(f"safe_stop must be a function of the bare environment, not {safe_stop!r}: it leaves the machine safe")
-    if isinstance(interrupt, ValueInterrupt):
+    if isinstance(others["interrupt"], ValueInterrupt):
         raise TypeError(
-            f"interrupt must be a rule about observations, not {type(interrupt).__name__}: the acting process gets the "
-            "actor's weights, not the critics'"
+            f"interrupt must be a rule about observations, not {type(others['interrupt']).__name__}: the acting process gets "
+            "the actor's weights, not the critics'"
         )
-    if not (interrupt is None or callable(interrupt)):
-        raise TypeError(f"interrupt must be a function or None, not {interrupt!r}")
+    for name, function in others.items():
+        if not (function is None or callable(function)):
+            raise TypeError(f"{name} must be a function or None, not {function!r}")
 
 
 #: Of each number: its type, whether None is allowed, its range, and that in words
@@ -442,6 +521,8 @@ class _JournalBuffer:
         self._model = model
 
     def add(self, obs: Any, next_obs: Any, action: Any, reward: Any, done: Any, infos: list[dict[str, Any]]) -> None:
+        if TAKEN_OVER in infos[0]:
+            return  # its option is not what was played
         # Stable-Baselines3 hands over arrays of its own, except for the observations, which the next step writes over.
         transition = Transition(_copy(obs), _copy(next_obs), action, reward, done, infos, self._model.num_timesteps)
         self._journal.add(transition.to_arrays(), transition.n_rows)
@@ -547,6 +628,7 @@ class _AsynchronousCallback(BaseCallback):
         self.trainer.weight_ages.append(self.link.weights.age)
 
     def _on_step(self) -> bool:
+        self.link.raise_if_failed()
         if self.link.log:
             for name, value in self.link.log.items():
                 self.logger.record(name, value)
@@ -558,6 +640,7 @@ class _AsynchronousCallback(BaseCallback):
                 self.logger.record("real_time/ticks", statistics.ticks)
                 self.logger.record("real_time/late_ticks", statistics.late_ticks)
                 self.logger.record("real_time/worst_lateness", statistics.worst_lateness)
+                self.logger.record("real_time/safe_ticks", statistics.safe_ticks)
         return True
 
 
