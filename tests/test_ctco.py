@@ -402,26 +402,6 @@ def test_target_entropies_may_be_schedules(random_walk_env):
         make(random_walk_env(), target_entropy="car")
 
 
-def test_target_entropies_are_annealed_in_the_last_part_of_training(random_walk_env):
-    model = make(random_walk_env(), target_entropy_anneal=0.4, n_rbf=3)  # ω has three entries
-    assert model._target_entropies.tolist() == [-1.0] * 4
-    model.learn(200)
-    for remaining, factor in ((1.0, 1.0), (0.4, 1.0), (0.1, 1.75), (0.0, 2.0)):
-        model._current_progress_remaining = remaining
-        model.train(1, 8)
-        assert model._target_entropies.tolist() == pytest.approx([-1.0 * factor] * 4)
-    # What was passed is where they start; with an anneal of 1 they fall from the first step on.
-    model = make(random_walk_env(), target_entropy_anneal=1.0, n_rbf=3, target_entropy=1.0, duration_target_entropy=0.5)
-    model._current_progress_remaining = 0.5
-    assert model._current_target_entropies() == (-0.5, 0.0)
-
-
-@pytest.mark.parametrize("fraction", [-0.1, 1.1, float("nan")])
-def test_an_anneal_that_is_no_fraction_of_training_is_refused(random_walk_env, fraction):
-    with pytest.raises(ValueError, match=r"target_entropy_anneal must be a fraction of training in \[0, 1\], not"):
-        make(random_walk_env(), target_entropy_anneal=fraction)
-
-
 def test_the_paper_s_algorithm():
     model = CTCO("MlpPolicy", "Pendulum-v1", **CTCO.paper_defaults(), device="cpu", seed=0, learning_starts=50).learn(100)
     assert model.critic.n_critics == 1

@@ -84,8 +84,6 @@ class CTCO(SoftOptionActorCritic):
     :param target_entropy: entropy of ω over the box [−1, 1] that a learned temperature keeps, or a function of the
         remaining progress; ``"auto"`` is −dim(ω)
     :param duration_target_entropy: likewise for d; ``"auto"`` is −1
-    :param target_entropy_anneal: the last fraction of training, in [0, 1], in which both target entropies fall, linearly, by
-        one nat a dimension in all: explore first, then get precise; 0 keeps them
     :param duration_learning_rate: step size of d's head; ``learning_rate`` by default
     :param entropy_reference: ``"uniform"``, ``"average"`` or ``"paper"``, see :func:`log_reference_density`
     :param canonical_options: whether critics see the same vector for all options that play the same actions, see
@@ -151,7 +149,6 @@ class CTCO(SoftOptionActorCritic):
         duration_ent_coef: str | float = "auto_0.02",
         target_entropy: str | float | Schedule = "auto",
         duration_target_entropy: str | float | Schedule = "auto",
-        target_entropy_anneal: float = 0.0,
         duration_learning_rate: float | Schedule | None = None,
         entropy_reference: EntropyReference = "uniform",
         canonical_options: bool = False,
@@ -169,8 +166,6 @@ class CTCO(SoftOptionActorCritic):
     ):
         if entropy_reference not in ENTROPY_REFERENCES:
             raise ValueError(f"entropy_reference must be one of {ENTROPY_REFERENCES}, not {entropy_reference!r}")
-        if not 0.0 <= target_entropy_anneal <= 1.0:
-            raise ValueError(f"target_entropy_anneal must be a fraction of training in [0, 1], not {target_entropy_anneal}")
         if entropy_reference == "paper" and duration_scale != "linear":
             raise ValueError(
                 "entropy_reference='paper' is of densities over d in s, so it needs duration_scale='linear', not "
@@ -221,7 +216,6 @@ class CTCO(SoftOptionActorCritic):
         )
         self.high_freq_penalty = high_freq_penalty
         self.target_decision_rate = target_decision_rate
-        self.target_entropy_anneal = target_entropy_anneal
         self.canonical_options = canonical_options
         self.fast_updates = fast_updates
         self.duration_learning_rate = duration_learning_rate
@@ -303,13 +297,6 @@ class CTCO(SoftOptionActorCritic):
 
     def _auto_target_entropies(self) -> tuple[float, float]:
         return float(-self.actor.omega_dim), -1.0
-
-    def _current_target_entropies(self) -> tuple[float, float]:
-        target, duration_target = super()._current_target_entropies()
-        if self.target_entropy_anneal == 0:
-            return target, duration_target
-        annealed = max(0.0, 1.0 - self._current_progress_remaining / self.target_entropy_anneal)
-        return target - annealed * self.actor.omega_dim, duration_target - annealed
 
     def _update_learning_rate(self, optimizers: list[th.optim.Optimizer] | th.optim.Optimizer) -> None:
         super()._update_learning_rate(optimizers)
