@@ -163,7 +163,8 @@ def _with_reward_rate(make_env: Callable[[], gym.Env], dt: float, discount_rate:
 
 def _make_sac(make_env: Callable[[], gym.Env], dt: float, arguments: dict[str, Any]) -> SAC:
     other_noise = arguments.get("use_sde") or arguments.get("pink_noise_seconds") is not None
-    return sac_at_rate(make_env(), dt=dt, policy="MlpPolicy" if other_noise else QuickSACPolicy, **arguments)
+    policy = "MlpPolicy" if other_noise else QuickSACPolicy
+    return sac_at_rate(make_env(), dt=dt, **{"policy": policy, **arguments})
 
 
 def _make_sac_eval_env(model: SAC, make_env: Callable[[], gym.Env], dt: float, discount_rate: float) -> VecEnv:
