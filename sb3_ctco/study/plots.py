@@ -189,6 +189,8 @@ def draw_learning_curves(points: Sequence[Record]) -> "Figure":
                 shown += means.tolist()
             ax.set_title(f"{find_task(task).label}, {rate} Hz")
             _return_axis(ax, shown)
+            # A task that has a rate of its own has nothing at others'.
+            ax.set_visible(len(shown) > 1)
         row[0].set_ylabel("discounted return")
     for ax in axes[-1]:
         ax.set_xlabel("task time [min]")

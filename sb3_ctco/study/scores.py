@@ -153,8 +153,9 @@ def draw_pareto(records: Sequence[Record], metric: str) -> "Figure":
             ax.set_xticks(_DECISION_RATES, [str(tick) for tick in _DECISION_RATES])
             ax.minorticks_off()
             ax.set_xlim(0.8, 700.0)
-            means = [value for value, _ in returns.values()]
-            ax.set_ylim(min(0.0, *means, 0.0) - 0.04 * max(*means, 0.1), 1.15 * max(*means, 0.1))
+            ax.set_visible(bool(returns))  # A task that has a rate of its own has nothing at others'.
+            means = [0.0, *(value for value, _ in returns.values())]
+            ax.set_ylim(min(means) - 0.04 * max(*means, 0.1), 1.15 * max(*means, 0.1))
             ax.set_title(f"{find_task(task).label}, {rate} Hz")
         row[0].set_ylabel("discounted return")
     for ax in axes[-1]:
