@@ -37,9 +37,10 @@ class CTCO(SoftOptionActorCritic):
     IROS 2023, https://arxiv.org/abs/2212.04407
 
     Where it differs from the paper, the paper's way is an argument away: entropy counts relative to the uniform
-    distribution (``entropy_reference="paper"``), two critics (``policy_kwargs=dict(n_critics=1)``), a temperature each
+    distribution (``entropy_reference="paper"``), two critics (``policy_kwargs=dict(n_critics=1)``), temperatures
     for ω and d, learned (pass numbers; the same one twice is the paper's β_E), ω squashed by tanh so that actions stay
-    in their bounds, and a shortest duration of one step (the paper's durations are in (0, d_max)).
+    in their bounds, and a shortest duration that follows from the discount (``d_min=0`` is one step, as the paper's durations
+    are in (0, d_max)).
 
     Settings that the paper's algorithm would have are in :meth:`paper_defaults`; the class's own were measured to learn
     faster on the paper's tasks.
