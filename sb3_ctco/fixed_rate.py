@@ -119,7 +119,10 @@ class _SACOnOptions(SAC):
 
 
 class _PricedReplayBuffer(OptionReplayBuffer):
-    """Decisions cost something, which is subtracted where they are sampled: what is recorded of them stays as it is."""
+    """Decisions cost something, which is subtracted where they are sampled: what is recorded of them stays as it is.
+
+    :param decision_price: in the unit of samples, that is after ``reward_scale``
+    """
 
     def __init__(self, *args: Any, decision_price: float = 0.0, **kwargs: Any):
         super().__init__(*args, **kwargs)
@@ -127,7 +130,7 @@ class _PricedReplayBuffer(OptionReplayBuffer):
 
     def _sample_fields(self, *args: Any) -> dict[str, Any]:
         fields = super()._sample_fields(*args)
-        fields["rewards"] -= self.decision_price * self._found_reward_scale()
+        fields["rewards"] -= self.decision_price
         return fields
 
 
@@ -233,7 +236,8 @@ def sac_at_rate(
         model = SAC(policy, env, train_freq=train_freq, gradient_steps=gradient_steps, **clock, **kwargs)
     else:
         # The buffer has the discount of each decision, so gamma is not used.
-        buffer = {"discount_rate": discount_rate, "reward_scale": reward_scale, "decision_price": decision_price}
+        price = decision_price * reward_scale
+        buffer = {"discount_rate": discount_rate, "reward_scale": reward_scale, "decision_price": price}
         kwargs |= {"replay_buffer_class": _PricedReplayBuffer, "replay_buffer_kwargs": buffer}
         env = hold_actions(env, hold_seconds, n_rbf, learned_duration, dt, discount_rate)
         model = _SACOnOptions(policy, env, **clock, **kwargs)

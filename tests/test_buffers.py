@@ -209,3 +209,11 @@ def test_a_scale_that_does_not_depend_on_the_unit_of_rewards(kind):
     np.testing.assert_allclose(rewards, [0.0, 50.0, -4.0 * 100 / 6], rtol=1e-6)
     add(buffer, kind, 3, [option_info(1.0, 30.0)])
     assert buffer._get_samples(np.array([3])).rewards.item() == pytest.approx(500.0)  # as critics learned
+
+
+@pytest.mark.parametrize("kind", ["vector", "dict"])
+def test_what_somebody_else_did_is_no_transition_of_the_policy(kind):
+    buffer = make_buffer(kind, n_envs=2)
+    add(buffer, kind, 1, [option_info(1.0, 3.0) | {"taken_over": True}, option_info(1.0, 4.0)])
+    assert buffer.size() == buffer.n_decisions == 1
+    assert buffer.integrated_rewards[0, 0] == 4.0

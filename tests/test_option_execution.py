@@ -493,3 +493,13 @@ def test_durations_follow_from_rate_and_discount(scripted_env, dt, gamma, gamma_
     assert wrapped.option_space == space
     assert CTCO("MlpPolicy", wrapped, gamma=gamma, gamma_dt=gamma_dt, device="cpu").option_space == space
     assert OptionExecutionWrapper(scripted_env(dt=dt), d_min=0.0).option_space.d_min == dt
+
+
+def test_options_mean_the_same_where_a_step_takes_longer_than_the_shortest(scripted_env):
+    """At a slower rate −0.5 still stands for 0.14 s, a quarter of the way from 0.02 to 0.5 s."""
+    model = CTCO("MlpPolicy", scripted_env(dt=0.02), d_min=0.0, d_max=0.5, n_rbf=1, device="cpu")
+    assert model.option_space.d_min == 0.02
+    for dt, n_steps in ((0.02, 7), (0.1, 1)):
+        env = model.wrap_env(scripted_env(dt=dt))
+        env.reset()
+        assert env.step([0.0, -0.5])[4]["option"]["n_steps"] == n_steps

@@ -74,8 +74,8 @@ class OptionExecutionWrapper(gym.Wrapper, RecordConstructorArgs):
     :param n_rbf: number of radial basis functions an action dimension; 1 repeats one action
     :param d_max: longest duration, in s; by default a fifth of the horizon 1/τ, 0.5 s at most, see
         :func:`~sb3_ctco.options.default_durations`
-    :param d_min: shortest duration, in s, and never less than one step (``dt``), which 0 stands for; by default a hundredth of
-        the horizon
+    :param d_min: shortest duration, in s; 0 for one step (``dt``), which an option takes in any case; by default a hundredth
+        of the horizon, or a step if that is longer
     :param dt: the interaction period, in s; by default what :func:`find_dt` finds
     :param discount_rate: τ, in 1/s; by default the paper's 0.404 (a factor of 0.98 over 0.05 s)
     :param reward: what ``step`` returns as reward: ``"sum"`` of the primitive rewards, which makes returns comparable
@@ -147,10 +147,10 @@ class OptionExecutionWrapper(gym.Wrapper, RecordConstructorArgs):
         if not sub_option_tolerance >= 0:
             raise ValueError(f"sub_option_tolerance must be at least 0, not {sub_option_tolerance}")
         dt = find_dt(env, required_by="OptionExecutionWrapper") if dt is None else dt
-        #: The settings that a policy for this environment must share.
         shortest, longest = default_durations(discount_rate)
-        d_min, d_max = shortest if d_min is None else d_min, longest if d_max is None else d_max
-        self.option_space = OptionSpace.make(n_rbf, d_max, max(d_min, dt), dt, discount_rate, trajectory, duration_scale, join)
+        d_min, d_max = max(shortest, dt) if d_min is None else d_min, longest if d_max is None else d_max
+        #: The settings that a policy for this environment must share.
+        self.option_space = OptionSpace.make(n_rbf, d_max, d_min, dt, discount_rate, trajectory, duration_scale, join)
         self.reward: Literal["sum", "integral"] = reward
         self.reward_unit: RewardUnit = reward_unit
 

@@ -9,10 +9,9 @@ from typing import Any, Literal, Protocol, SupportsFloat, runtime_checkable
 import gymnasium as gym
 from gymnasium.utils import RecordConstructorArgs
 
-from sb3_ctco.options import LAST_ACTION
+from sb3_ctco.options import LAST_ACTION, TAKEN_OVER
 from sb3_ctco.safety import Guard, Safety
 from sb3_ctco.wrappers.checks import reset_env
-from sb3_ctco.wrappers.take_over import TAKEN_OVER
 from sb3_ctco.wrappers.timing import find_dt
 
 logger = logging.getLogger(__name__)

@@ -13,11 +13,19 @@ from gymnasium.utils import RecordConstructorArgs
 from stable_baselines3.common.env_util import unwrap_wrapper
 
 from sb3_ctco.option_array import plain
-from sb3_ctco.options import LAST_ACTION, PLAYED, FloatArray, ValueInterrupt, shortest_steps, stack, with_last_action
+from sb3_ctco.options import (
+    LAST_ACTION,
+    PLAYED,
+    TAKEN_OVER,
+    FloatArray,
+    ValueInterrupt,
+    shortest_steps,
+    stack,
+    with_last_action,
+)
 from sb3_ctco.wrappers.option_execution import ON_THE_WAY, OptionExecutionWrapper
 from sb3_ctco.wrappers.real_time import RealTimeWrapper
 from sb3_ctco.wrappers.step_sequence import SequenceResult, StepSequence
-from sb3_ctco.wrappers.take_over import TAKEN_OVER
 
 #: ``interrupt(observation of the last decision, observation, seconds since that one)``: whether to end the option
 Interrupt = Callable[[Any, Any, float], bool]

@@ -9,14 +9,12 @@ import numpy as np
 from gymnasium.utils import RecordConstructorArgs
 
 from sb3_ctco.datasets import RecordedTrajectory
-from sb3_ctco.options import LAST_ACTION, stack
+from sb3_ctco.options import LAST_ACTION, TAKEN_OVER, stack
 from sb3_ctco.wrappers.checks import reset_env
 from sb3_ctco.wrappers.timing import find_dt
 
 #: ``take_over(observation)``: the action to send in place of the policy's, in the environment's units, or None
 TakeOver = Callable[[Any], Any]
-#: Key of the infos of steps in which another action was sent than the policy's
-TAKEN_OVER = "taken_over"
 
 
 class TakeOverWrapper(gym.Wrapper, RecordConstructorArgs):

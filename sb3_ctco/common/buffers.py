@@ -14,6 +14,7 @@ from stable_baselines3.common.vec_env import VecNormalize
 from sb3_ctco.options import (
     DEFAULT_DISCOUNT_RATE,
     REWARD_UNITS,
+    TAKEN_OVER,
     ActionBox,
     OptionSpace,
     RewardUnit,
@@ -117,12 +118,13 @@ class _OptionStorage(ReplayBuffer):
 
         :param infos: each with ``info["option"]`` of :class:`~sb3_ctco.wrappers.OptionExecutionWrapper`, and
             ``info["sub_options"]`` if it hands over any; nothing is stored of environments whose option runs on
-            (``info["pending"]`` of :class:`~sb3_ctco.vec_env.AsyncOptionVecEnv`)
+            (``info["pending"]`` of :class:`~sb3_ctco.vec_env.AsyncOptionVecEnv`), or where something else was sent than the
+            policy's actions (``info["taken_over"]``, of a guard or of :class:`~sb3_ctco.wrappers.TakeOverWrapper`)
         :raises ValueError: if that is missing, not finite, or was discounted at another rate, or if sub-options saw other
             observations than these; nothing is stored then
         """
         try:
-            options = {i: info["option"] for i, info in enumerate(infos) if PENDING not in info}
+            options = {i: info["option"] for i, info in enumerate(infos) if PENDING not in info and TAKEN_OVER not in info}
         except KeyError:
             raise ValueError(
                 f"{type(self).__name__} needs info['option']: wrap the environment with "
@@ -219,13 +221,13 @@ class _OptionStorage(ReplayBuffer):
             )
         rewards = np.asarray(rewards, dtype=np.float64)
         plan = ActionBox(self.primitive_action_space.low, self.primitive_action_space.high).normalise(actions)
+        _check_recorded(observations, plan, rewards)
         sent = None
         if space.joined:
             # As an episode begins: with the middle of the box
             sent = np.vstack([np.zeros((1, plan.shape[1])), plan])
-            observations = with_last_action(self.observation_space, observations, _as_many(sent, observations))
+            observations = with_last_action(self.observation_space, observations, sent)
         seen = _recorded(observations, self.observation_space)
-        _check_recorded(seen, plan, rewards)
 
         n_steps = len(rewards)
         firsts = np.arange(n_steps).repeat(n_stretches)
@@ -324,21 +326,23 @@ class _OptionStorage(ReplayBuffer):
             return self._tensor(self._normalize_obs(rows(stored), env))  # type: ignore[arg-type]
 
         dones = rows(self.dones) * (1.0 - rows(self.timeouts))
+        rewards = rows(self.integrated_rewards)[:, None]
         return {
             "observations": observations(self.observations),
             "actions": self._tensor(rows(self.actions)),
             "next_observations": observations(self.next_observations),
             "dones": self._tensor(dones[:, None]),
-            "rewards": self._tensor(rows(self.integrated_rewards)[:, None]) * self._found_reward_scale(),
+            "rewards": self._tensor(rewards) * self._found_reward_scale(rewards),
             "discounts": self._tensor(discount(rows(self.durations), self.discount_rate)[:, None]),
         }
 
-    def _found_reward_scale(self) -> float:
+    def _found_reward_scale(self, rewards: np.ndarray) -> float:
+        """What samples with these rewards are multiplied by."""
         if self.reward_scale != "auto":
             return self.reward_scale
+        if not rewards.any():
+            return 1.0  # To nothing every scale is the same.
         paid = self.integrated_rewards != 0
-        if not paid.any():
-            return 1.0  # Nothing was paid so far, so every scale is the same.
         # Without a discount, forever is 100 s.
         forever = np.abs(self.integrated_rewards[paid]) / -np.expm1(-max(self.discount_rate, 0.01) * self.durations[paid])
         self.reward_scale = 100.0 / float(forever.max())
@@ -400,19 +404,14 @@ def _recorded(observations: Any, space: spaces.Space) -> Stacked:
     return stacked
 
 
-def _as_many(rows: np.ndarray, observations: Any) -> np.ndarray:
-    """As many rows as there are observations, which are checked later."""
-    count = len(next(iter(observations.values())) if isinstance(observations, dict) else observations)
-    return np.resize(rows, (count, rows.shape[1]))
-
-
-def _check_recorded(seen: Stacked, plan: np.ndarray, rewards: np.ndarray) -> None:
+def _check_recorded(observations: Any, plan: np.ndarray, rewards: np.ndarray) -> None:
     """Refuse a recorded trajectory whose parts do not fit together.
 
-    :param seen: observations, stacked
+    :param observations: as they are given, whatever their shape
     :param plan: actions, normalised, ``[n, action_dim]``
     """
-    n_seen = {len(leaf) for leaf in (seen.values() if isinstance(seen, dict) else [seen])}
+    leaves = observations.values() if isinstance(observations, dict) else [observations]
+    n_seen = {len(np.atleast_1d(leaf)) for leaf in leaves}
     if rewards.ndim != 1 or len(rewards) == 0 or len(plan) != len(rewards) or n_seen != {len(rewards) + 1}:
         raise ValueError(
             f"a trajectory has n actions, n rewards and n + 1 observations, the last one of after the last action, not "
@@ -449,9 +448,10 @@ class OptionReplayBuffer(_OptionStorage):
     and an environment wrapped in :class:`~sb3_ctco.wrappers.OptionExecutionWrapper` they learn on the semi-Markov process.
 
     :param discount_rate: τ, in 1/s; the wrapper's
-    :param reward_scale: what R is multiplied by in samples. ``"auto"`` finds it at the first sample after something was paid,
-        and keeps it: the best (or worst) option so far, R/(1 − γ(d)) if it were repeated forever, is worth 100. That does not
-        depend on the unit of rewards, and it is what a reward of 1 a step is worth to SAC with its usual discount of 0.99
+    :param reward_scale: what R is multiplied by in samples. ``"auto"`` finds it at the first sample in which something was
+        paid, and keeps it: the best (or worst) option so far, R/(1 − γ(d)) if it were repeated forever, is worth 100. That
+        does not depend on the unit of rewards, and it is what a reward of 1 a step is worth to SAC with its usual discount
+        of 0.99
     :param demonstration_fraction: part of each batch that is drawn from what ``add_trajectory`` stored, if that is anything
     :param option_space: what options mean, for ``add_trajectory``; CTCO and FiGAR-SAC tell their buffer
     :param primitive_action_space: the action space of the bare environment, likewise

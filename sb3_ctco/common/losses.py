@@ -57,8 +57,8 @@ def log_reference_density(sizes: th.Tensor, d_min: float, d_max: float, referenc
 
     ``"uniform"`` is the uniform distribution over all options: log π − log u is never negative on average, so
     a decision is never paid for its entropy, and a policy of little entropy pays for each decision.
-    ``"average"`` is what the policy has on average over a batch, whatever that is, hence None: zero on average, so that β_h is
-    all that a decision costs.
+    ``"average"`` is the batch's own average of log π, which is not known beforehand: None. Entropy then costs nothing on
+    average, so that β_h is all that a decision costs.
     ``"paper"`` is the unit density over (ω, d in s): log π as it stands.
 
     :param sizes: how many entries of an option each density is of, the duration being the last, ``[n + 1]``

@@ -63,8 +63,7 @@ class OptionOffPolicyAlgorithm(OffPolicyAlgorithm):
 
     :param n_rbf: number of radial basis functions an action dimension
     :param d_max: longest duration of an option, in s
-    :param d_min: shortest duration, in s, and never less than one step of the environment; by default what
-        ``OptionExecutionWrapper`` has
+    :param d_min: shortest duration, in s, by default what ``OptionExecutionWrapper`` has; 0 for one step of the environment
     :param dt: the environment's interaction period, in s; by default found in the environment
     :param trajectory: how ω becomes actions, a name in ``sb3_ctco.options.TRAJECTORIES`` or a class
     :param duration_scale: ``"log"`` or ``"linear"``, see :class:`~sb3_ctco.options.OptionSpace`
@@ -188,7 +187,7 @@ class OptionOffPolicyAlgorithm(OffPolicyAlgorithm):
                 f"dt={self.dt} s and d_min={self.d_min} s are found in an environment, and {type(self).__name__} has not "
                 "had one: pass it env, or dt and d_min"
             )
-        return OptionSpace.make(**{**self._option_arguments, "dt": self.dt, "d_min": max(self.d_min, self.dt)})
+        return OptionSpace.make(**self._option_arguments)
 
     @property
     def _option_arguments(self) -> dict[str, Any]:
@@ -284,8 +283,6 @@ class OptionOffPolicyAlgorithm(OffPolicyAlgorithm):
         """The options' settings of an environment, once options mean the same in it as to the algorithm."""
         settings: list[OptionSpace] = env.get_attr("option_space")
         known = {name: value for name, value in self._option_arguments.items() if value is not None}
-        if self.d_min is not None:
-            known["d_min"] = max(self.d_min, settings[0].dt)  # as the wrapper has it
         expected = OptionSpace.make(**{**settings[0].arguments, **known})
         for one in settings:
             for name, (value, found) in expected.differences(one).items():

@@ -170,6 +170,7 @@ class SoftOptionActorCritic(OptionOffPolicyAlgorithm):
                 losses.append(update(self.replay_buffer.sample(batch_size, env=self._vec_normalize_env)))
 
         self._n_updates += gradient_steps
+        # What "auto" found is saved with the model, which its replay buffer is not.
         self.replay_buffer_kwargs["reward_scale"] = self.replay_buffer.reward_scale  # type: ignore[attr-defined]
         # Read once, because each reading waits for the device.
         pi_loss_mean, q_loss_mean, ent_coef_loss_mean = th.stack(losses).mean(dim=0).tolist()

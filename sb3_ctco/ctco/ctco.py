@@ -64,8 +64,9 @@ class CTCO(SoftOptionActorCritic):
         as options of their own, which counts in ``buffer_size``; 0 is the paper's way
     :param n_rbf: number of radial basis functions an action dimension
     :param d_max: longest duration of an option, in s; by default a fifth of the horizon 1/τ, and 0.5 s at most
-    :param d_min: shortest duration, in s, and never less than one step of the environment, which 0 stands for; by default a
-        hundredth of the horizon, and 0.025 s at most, see :func:`~sb3_ctco.options.default_durations`
+    :param d_min: shortest duration, in s; 0 for one step of the environment, which an option takes in any case; by default a
+        hundredth of the horizon and 0.025 s at most, or a step if that is longer, see
+        :func:`~sb3_ctco.options.default_durations`
     :param dt: interaction period of the environment, in s; by default found in the environment
     :param trajectory: how ω becomes actions: ``"rbf"``, the paper's radial basis functions, ``"bezier"``, or a subclass of
         :class:`~sb3_ctco.options.Trajectory`

@@ -33,7 +33,7 @@ from stable_baselines3.common.vec_env.base_vec_env import VecEnvObs, VecEnvStepR
 from sb3_ctco.common.buffers import AddedTrajectory
 from sb3_ctco.common.option_algorithm import OptionOffPolicyAlgorithm
 from sb3_ctco.datasets import RecordedTrajectory
-from sb3_ctco.options import ValueInterrupt
+from sb3_ctco.options import TAKEN_OVER, ValueInterrupt
 from sb3_ctco.realtime.journal import JournalReader, JournalWriter, check_meaning, repair_journal, segments
 from sb3_ctco.realtime.learner import (
     LearnerError,
@@ -53,7 +53,6 @@ from sb3_ctco.wrappers import (
     TakeOver,
     TakeOverWrapper,
 )
-from sb3_ctco.wrappers.take_over import TAKEN_OVER
 
 logger = logging.getLogger(__name__)
 

@@ -46,8 +46,10 @@ def repeatable() -> Iterator[None]:
     """The same intervals each time: rliable draws from NumPy's global generator."""
     state = np.random.get_state()
     np.random.seed(0)
-    yield
-    np.random.set_state(state)
+    try:
+        yield
+    finally:
+        np.random.set_state(state)
 
 
 def by_line(records: Sequence[Record], task: str, metric: str) -> dict[Line, dict[int, list[float]]]:
