@@ -148,7 +148,8 @@ class OptionExecutionWrapper(gym.Wrapper, RecordConstructorArgs):
             raise ValueError(f"sub_option_tolerance must be at least 0, not {sub_option_tolerance}")
         dt = find_dt(env, required_by="OptionExecutionWrapper") if dt is None else dt
         shortest, longest = default_durations(discount_rate)
-        d_min, d_max = max(shortest, dt) if d_min is None else d_min, longest if d_max is None else d_max
+        d_min = max(shortest, dt) if d_min is None else d_min or dt
+        d_max = longest if d_max is None else d_max
         #: The settings that a policy for this environment must share.
         self.option_space = OptionSpace.make(n_rbf, d_max, d_min, dt, discount_rate, trajectory, duration_scale, join)
         self.reward: Literal["sum", "integral"] = reward

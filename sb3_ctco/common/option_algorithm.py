@@ -187,7 +187,7 @@ class OptionOffPolicyAlgorithm(OffPolicyAlgorithm):
                 f"dt={self.dt} s and d_min={self.d_min} s are found in an environment, and {type(self).__name__} has not "
                 "had one: pass it env, or dt and d_min"
             )
-        return OptionSpace.make(**self._option_arguments)
+        return OptionSpace.make(**{**self._option_arguments, "d_min": self.d_min or self.dt})
 
     @property
     def _option_arguments(self) -> dict[str, Any]:
@@ -283,7 +283,8 @@ class OptionOffPolicyAlgorithm(OffPolicyAlgorithm):
         """The options' settings of an environment, once options mean the same in it as to the algorithm."""
         settings: list[OptionSpace] = env.get_attr("option_space")
         known = {name: value for name, value in self._option_arguments.items() if value is not None}
-        expected = OptionSpace.make(**{**settings[0].arguments, **known})
+        known = {**settings[0].arguments, **known}
+        expected = OptionSpace.make(**{**known, "d_min": known["d_min"] or known["dt"]})
         for one in settings:
             for name, (value, found) in expected.differences(one).items():
                 raise ValueError(

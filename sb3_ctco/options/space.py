@@ -87,14 +87,13 @@ class OptionSpace:
         """An option space from the arguments that wrappers and algorithms take.
 
         :param n_rbf: number of weights an action dimension
-        :param d_min: shortest duration, in s; 0 for one step
         :param trajectory: a name in :data:`~sb3_ctco.options.trajectory.TRAJECTORIES`, or a class
         """
         if isinstance(trajectory, str):
             if trajectory not in TRAJECTORIES:
                 raise ValueError(f"trajectory must be one of {list(TRAJECTORIES)} or a Trajectory class, not {trajectory!r}")
             trajectory = TRAJECTORIES[trajectory]
-        return cls(trajectory(n_rbf), d_max, d_min or dt, dt, discount_rate, duration_scale, join)
+        return cls(trajectory(n_rbf), d_max, d_min, dt, discount_rate, duration_scale, join)
 
     @property
     def joined(self) -> bool:
