@@ -1,7 +1,7 @@
 """Trained policies that are pushed, or see nothing new for a while: options whole, replanned, or ended by the critics.
 
-    sb3-ctco study run --preset benchmarks/joins.yml --tasks cheetah ball_in_cup --settings free
-    python benchmarks/disturbances.py runs/study/joins --setting free
+    sb3-ctco study run --preset quick --rates 500 --settings tuned --tasks cheetah ball_in_cup --seeds 0 1 2
+    python benchmarks/disturbances.py runs/study/quick
 
 Every model of CTCO with this setting in a study's folder plays greedily,
 
@@ -85,7 +85,7 @@ def every(period: float) -> Callable[[Any, Any, float], bool]:
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("folder", type=Path)
-    parser.add_argument("--setting", default="free")
+    parser.add_argument("--setting", default="tuned")
     parser.add_argument("--episodes", type=int, default=10, help="of each model, condition and way to play")
     parser.add_argument("--period", type=float, default=0.05, help="of replanning, in s")
     parser.add_argument("--check-period", type=float, default=0.02, help="of the critics, in s")
