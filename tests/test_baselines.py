@@ -29,7 +29,8 @@ def make(algorithm, env, kwargs, policy="MlpPolicy", **further):
 def make_env(algorithm, env, n_envs=1, **kwargs):
     """A VecEnv, wrapped if the algorithm decides by options."""
     if algorithm is FiGARSAC:
-        kwargs |= {"wrapper_class": OptionExecutionWrapper, "wrapper_kwargs": {"n_rbf": 1, "d_max": 0.4}}
+        wrapper_kwargs = {"n_rbf": 1, "d_max": 0.4, "duration_scale": "linear"}
+        kwargs |= {"wrapper_class": OptionExecutionWrapper, "wrapper_kwargs": wrapper_kwargs}
     return make_vec_env(env, n_envs, **kwargs)
 
 

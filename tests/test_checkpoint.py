@@ -21,7 +21,11 @@ LEARNERS = {
     DACPPO: {"n_steps": 20, "batch_size": 16, "n_epochs": 1, "policy_kwargs": {"net_arch": [8]}, "seed": 3},
     SAC: {**OFF_POLICY, "replay_buffer_class": OptionReplayBuffer},
 }
-WRAPPERS = {CTCO: {"d_max": 0.3}, FiGARSAC: {"n_rbf": 1, "d_max": 0.3}, SAC: {"d_max": 0.3, "n_sub_options": 3}}
+WRAPPERS = {
+    CTCO: {"d_max": 0.3},
+    FiGARSAC: {"n_rbf": 1, "d_max": 0.3, "duration_scale": "linear"},
+    SAC: {"d_max": 0.3, "n_sub_options": 3},
+}
 
 
 def vec_env(algorithm, make_env, n_envs=1):

@@ -143,7 +143,7 @@ def test_the_price_of_a_decision_is_the_penalty_alone(scripted_env):
         env = scripted_env(rewards=lambda step, action: 0.0, dt=0.1, truncate_at=50)
         small = {"n_rbf": 1, "d_max": 2.0, "batch_size": 64, "policy_kwargs": {"net_arch": [32, 32]}, "learning_rate": 1e-3}
         timing = {"gamma": 0.9, "gamma_dt": 0.1, "updates_per_second": 5, "learning_starts": 500}
-        temperatures = {"ent_coef": 0.1, "duration_ent_coef": 0.1}
+        temperatures = {"ent_coef": 0.1, "duration_ent_coef": 0.1, "duration_scale": "linear"}
         model = make(env, **{**small, **timing, **temperatures, "seed": seed, **kwargs}).learn(6000)
         obs = th.tensor([[count, 0.0] for count in range(0, 50, 5)]).repeat(200, 1)
         with th.no_grad():
@@ -163,7 +163,7 @@ def test_a_decision_is_never_paid_for_its_entropy():
     _, log_prob = model.actor.option_log_prob(th.zeros(4096, 2))
     assert model.entropy_costs(log_prob @ model._parts).mean() > -0.05
     # With the paper's density the same policy is paid at each decision.
-    model = make(random_walk_like(), ent_coef=1.0, duration_ent_coef=1.0, entropy_reference="paper")
+    model = make(random_walk_like(), ent_coef=1.0, duration_ent_coef=1.0, entropy_reference="paper", duration_scale="linear")
     assert model.entropy_costs(log_prob @ model._parts).mean() < -0.5
 
 
@@ -174,7 +174,8 @@ def test_paper_entropies_need_the_papers_durations():
 
 def test_the_critics_see_what_is_played(random_walk_env):
     """Of one step the first of two weights is all: options that differ in the other have one value, and no gradient by it."""
-    model = make(random_walk_env(), n_rbf=2, d_max=0.5, trajectory="bezier", canonical_options=True).learn(40)
+    options = {"n_rbf": 2, "d_max": 0.5, "duration_scale": "linear"}
+    model = make(random_walk_env(), **options, trajectory="bezier", canonical_options=True).learn(40)
     obs = th.zeros(2, 2)
     # Of one step: up to 0.15 s, which is −0.75 on the way from 0.1 to 0.5 s
     options = th.tensor([[0.3, 0.9, -1.0], [0.3, -0.4, -0.8]], requires_grad=True)
@@ -187,7 +188,7 @@ def test_the_critics_see_what_is_played(random_walk_env):
     th.testing.assert_close(model._as_critics_see(longer), th.tensor([[0.3, 0.9, 0.0]]))
     # Where the shortest option has two steps, weights stay as they are, and so does all.
     for kwargs in ({"d_min": 0.2, "canonical_options": True}, {"canonical_options": False}):
-        assert make(random_walk_env(), n_rbf=2, d_max=0.5, **kwargs)._as_critics_see(longer) is longer
+        assert make(random_walk_env(), **{**options, **kwargs})._as_critics_see(longer) is longer
 
 
 def test_what_was_counted_goes_on_after_loading(tmp_path, random_walk_env):
@@ -273,7 +274,12 @@ def test_with_one_step_options_targets_and_losses_are_sacs():
     sac = SAC("MlpPolicy", "Pendulum-v1", ent_coef=0.5, **kwargs).learn(60)
     options = {"n_rbf": 1, "d_min": 0.05, "d_max": 0.05, "n_sub_options": 0, "high_freq_penalty": 0.0}
     tau = discount_rate_from_gamma(0.97, 0.05)
-    unit = {"reward_scale": 1 / step_weight(0.05, tau), "gamma_dt": 0.05, "entropy_reference": "paper"}
+    unit = {
+        "reward_scale": 1 / step_weight(0.05, tau),
+        "gamma_dt": 0.05,
+        "entropy_reference": "paper",
+        "duration_scale": "linear",
+    }
     model = CTCO("MlpPolicy", "Pendulum-v1", ent_coef=0.5, **options, **unit, **kwargs).learn(60)
     copy_weights(sac, model)
     # The same experience: an option is a normalised action and a duration; its R is in reward × s.
@@ -453,6 +459,7 @@ def test_one_update_by_hand(random_walk_env):
         ent_coef=0.2,
         duration_ent_coef=0.4,
         high_freq_penalty=0.05,
+        canonical_options=False,
     )
     model.learn(200)
     # Let the targets differ from what they follow.
@@ -559,6 +566,7 @@ def test_options_of_one_step_are_sac(scripted_env):
         d_max=dt,
         high_freq_penalty=0.0,
         entropy_reference="paper",
+        duration_scale="linear",
         ent_coef=0.2,
         learning_starts=1000,
         learning_rate=0.0,
@@ -748,7 +756,7 @@ def test_a_bad_environment_leaves_no_trace_in_the_buffer(scripted_env, bad):
             return obs, reward, terminated, truncated, info
 
     env = Env(truncate_at=20)
-    model = make(env, d_max=0.5, learning_starts=1000)
+    model = make(env, d_max=0.5, duration_scale="linear", learning_starts=1000)
     with pytest.raises((RuntimeError, ValueError), match=r"the motor is hot|not finite"):
         model.learn(100)
     buffer = model.replay_buffer

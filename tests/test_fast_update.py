@@ -38,7 +38,7 @@ def plain(model):
         {},
         {"ent_coef": 0.2, "duration_ent_coef": "auto"},
         {"ent_coef": 0.2, "duration_ent_coef": 0.0},
-        {"entropy_reference": "paper", "duration_learning_rate": 1e-4},
+        {"entropy_reference": "paper", "duration_scale": "linear", "duration_learning_rate": 1e-4},
         {"policy_kwargs": {"n_critics": 1, "net_arch": [8]}},
         {"policy_kwargs": {"n_critics": 3, "net_arch": {"pi": [8, 8, 8], "qf": []}}},
         {"policy_kwargs": {"net_arch": [8], "optimizer_kwargs": {"betas": (0.8, 0.9), "eps": 1e-5, "weight_decay": 0.1}}},

@@ -307,9 +307,10 @@ def test_longest_repetition_in_seconds(random_walk_env, d_max, n):
 
 @pytest.mark.parametrize("kwargs", [{"n_repetitions": 4}, {"d_max": 0.4}])
 def test_wrapped_environments(random_walk_env, kwargs):
-    env = OptionExecutionWrapper(random_walk_env(), n_rbf=1, d_max=0.4)
+    env = OptionExecutionWrapper(random_walk_env(), n_rbf=1, d_max=0.4, duration_scale="linear")
     assert make(env, **kwargs).n_repetitions == 4
-    vec_env = make_vec_env(random_walk_env, 2, wrapper_class=OptionExecutionWrapper, wrapper_kwargs={"n_rbf": 1, "d_max": 0.4})
+    wrapper_kwargs = {"n_rbf": 1, "d_max": 0.4, "duration_scale": "linear"}
+    vec_env = make_vec_env(random_walk_env, 2, wrapper_class=OptionExecutionWrapper, wrapper_kwargs=wrapper_kwargs)
     model = make(vec_env, **kwargs).learn(80)
     stored = decode_repetitions(model.replay_buffer.actions[: model.replay_buffer.pos, :, 1], 4)
     np.testing.assert_allclose(stored * 0.1, model.replay_buffer.durations[: model.replay_buffer.pos], rtol=1e-5)
@@ -321,7 +322,7 @@ def test_wrapped_environments(random_walk_env, kwargs):
 )
 def test_disagreeing_settings_are_refused(random_walk_env, wrapper, name):
     with pytest.raises(ValueError, match=f"options have {name}="):
-        make(OptionExecutionWrapper(random_walk_env(), **{"n_rbf": 1, **wrapper}), n_repetitions=4)
+        make(OptionExecutionWrapper(random_walk_env(), **{"n_rbf": 1, "duration_scale": "linear", **wrapper}), n_repetitions=4)
 
 
 @pytest.mark.parametrize(

@@ -15,7 +15,7 @@ from sb3_ctco.wrappers import RealTimeOptionWrapper
 
 DT = 0.1
 # With one weight an option is [action, duration]; durations run from 0.1 s (−1) to 1 s (1).
-SETTINGS = {"n_rbf": 1, "d_max": 1.0}
+SETTINGS = {"n_rbf": 1, "d_max": 1.0, "duration_scale": "linear"}
 SMALL = {"policy_kwargs": {"net_arch": [8]}, "batch_size": 8, "device": "cpu", "seed": 0, "buffer_size": 2000}
 
 

@@ -263,7 +263,8 @@ def test_an_entry_of_that_name_is_refused():
 
 def test_a_free_join_is_what_it_was(random_walk_env):
     """With the same option vectors: the weights alone say where actions begin, and observations are the environment's."""
-    env, inside = OptionExecutionWrapper(random_walk_env(), n_rbf=2, d_max=1.5), random_walk_env()
+    env = OptionExecutionWrapper(random_walk_env(), n_rbf=2, d_max=1.5, trajectory="rbf", duration_scale="linear")
+    inside = random_walk_env()
     assert env.observation_space == inside.observation_space
     env.reset(seed=0)
     option = np.array([0.5, -0.25, 0.0])

@@ -23,7 +23,8 @@ TAU = math.log(2.0)  # half in a second
 
 
 def wrap(env, **kwargs):
-    return OptionExecutionWrapper(env, **{"n_rbf": 1, "d_max": 1.0, "discount_rate": TAU, **kwargs})
+    paper = {"trajectory": "rbf", "duration_scale": "linear"}
+    return OptionExecutionWrapper(env, **{"n_rbf": 1, "d_max": 1.0, "discount_rate": TAU, **paper, **kwargs})
 
 
 # --- one decision
@@ -497,7 +498,7 @@ def test_durations_follow_from_rate_and_discount(scripted_env, dt, gamma, gamma_
 
 def test_options_mean_the_same_where_a_step_takes_longer_than_the_shortest(scripted_env):
     """At a slower rate −0.5 still stands for 0.14 s, a quarter of the way from 0.02 to 0.5 s."""
-    model = CTCO("MlpPolicy", scripted_env(dt=0.02), d_min=0.0, d_max=0.5, n_rbf=1, device="cpu")
+    model = CTCO("MlpPolicy", scripted_env(dt=0.02), d_min=0.0, d_max=0.5, n_rbf=1, duration_scale="linear", device="cpu")
     assert model.option_space.d_min == 0.02
     for dt, n_steps in ((0.02, 7), (0.1, 1)):
         env = model.wrap_env(scripted_env(dt=dt))

@@ -280,6 +280,7 @@ def test_with_continuous_joins_sub_options_leave_from_the_action_before_them(scr
         n_rbf=2,
         d_max=1.0,
         trajectory="bezier",
+        duration_scale="linear",
         n_sub_options=8,
         sub_option_tolerance=2.0,
         join="continuous",

@@ -42,7 +42,7 @@ _SHORT = {
 }
 ALGORITHMS = {CTCO: _SHORT, FiGARSAC: _SHORT}
 #: OptionExecutionWrapper's arguments for each
-WRAPPER: dict[type, dict[str, Any]] = {CTCO: {"d_max": 0.3}, FiGARSAC: {"n_rbf": 1, "d_max": 0.3}}
+WRAPPER: dict[type, dict[str, Any]] = {CTCO: {"d_max": 0.3}, FiGARSAC: {"n_rbf": 1, "d_max": 0.3, "duration_scale": "linear"}}
 #: For frames that are stacked outside, where sub-options cannot be
 WITHOUT_SUB_OPTIONS: dict[type, dict[str, Any]] = {CTCO: {"n_sub_options": 0}, FiGARSAC: {}}
 pytestmark = pytest.mark.parametrize("algorithm", ALGORITHMS, ids=lambda algorithm: algorithm.__name__)

@@ -76,7 +76,7 @@ class Learner:
 
 LEARNERS = {
     "CTCO": Learner(CTCO, {**_OFF_POLICY, "d_max": 0.3}, {"d_max": 0.3}),
-    "FiGARSAC": Learner(FiGARSAC, {**_OFF_POLICY, "d_max": 0.3}, {"n_rbf": 1, "d_max": 0.3}),
+    "FiGARSAC": Learner(FiGARSAC, {**_OFF_POLICY, "d_max": 0.3}, {"n_rbf": 1, "d_max": 0.3, "duration_scale": "linear"}),
     "DACPPO": Learner(DACPPO, _ON_POLICY),
     "SAC": Learner(SAC, {**_OFF_POLICY, "replay_buffer_class": OptionReplayBuffer}, {"d_max": 0.3, "n_sub_options": 2}),
 }

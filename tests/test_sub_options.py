@@ -28,9 +28,8 @@ TAU = math.log(2.0)
 
 
 def wrap(env, **kwargs):
-    return OptionExecutionWrapper(
-        env, **{"n_rbf": 3, "d_max": 1.5, "discount_rate": TAU, "n_sub_options": 8, "sub_option_tolerance": 2.0, **kwargs}
-    )
+    of_options = {"n_rbf": 3, "d_max": 1.5, "discount_rate": TAU, "trajectory": "rbf", "duration_scale": "linear"}
+    return OptionExecutionWrapper(env, **{**of_options, "n_sub_options": 8, "sub_option_tolerance": 2.0, **kwargs})
 
 
 def play(env, n_options=200, seed=0):
@@ -423,9 +422,9 @@ def test_the_ring_goes_round(random_walk_env):
 
 
 def test_the_algorithm_tells_the_environment_how_many(random_walk_env):
-    env = OptionExecutionWrapper(random_walk_env(), n_sub_options=2)
+    env = OptionExecutionWrapper(random_walk_env(), n_sub_options=2, duration_scale="linear")
     env.reset(seed=0)
-    model = make(env, n_sub_options=5)
+    model = make(env, n_sub_options=5, duration_scale="linear")
     assert env.n_sub_options == 5
     with pytest.raises(ResetNeeded):
         env.step(env.action_space.sample())  # whose first observation nobody has kept

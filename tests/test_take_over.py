@@ -14,7 +14,7 @@ def between(first, last):
 def make_env(scripted_env, take_over, join="free", **kwargs):
     recorded = []
     inner = TakeOverWrapper(scripted_env(rewards=lambda step, action: float(step), **kwargs), take_over, recorded.append)
-    env = RealTimeOptionWrapper(inner, n_rbf=1, d_max=1.0, join=join)
+    env = RealTimeOptionWrapper(inner, n_rbf=1, d_max=1.0, duration_scale="linear", join=join)
     env.reset(seed=0)
     return env, recorded
 

@@ -187,7 +187,7 @@ def test_figar_sac_stores_the_repetitions_that_ran(random_walk_env, min_ready):
         n_envs=3,
         seed=0,
         wrapper_class=OptionExecutionWrapper,
-        wrapper_kwargs={"n_rbf": 1, "d_max": 1.2},
+        wrapper_kwargs={"n_rbf": 1, "d_max": 1.2, "duration_scale": "linear"},
         vec_env_cls=AsyncOptionVecEnv,
         vec_env_kwargs={"start_method": "fork", "min_ready": min_ready},
     )

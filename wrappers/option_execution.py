@@ -109,8 +109,8 @@ class OptionExecutionWrapper(gym.Wrapper, RecordConstructorArgs):
         reward_unit: RewardUnit = "rate",
         n_sub_options: int = 0,
         sub_option_tolerance: float = 0.1,
-        trajectory: str | type[Trajectory] = "rbf",
-        duration_scale: DurationScale = "linear",
+        trajectory: str | type[Trajectory] = "bezier",
+        duration_scale: DurationScale = "log",
         join: Join = "free",
     ):
         RecordConstructorArgs.__init__(

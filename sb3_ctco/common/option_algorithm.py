@@ -51,14 +51,6 @@ from sb3_ctco.wrappers import OptionExecutionWrapper, find_dt
 SelfOptionOffPolicyAlgorithm = TypeVar("SelfOptionOffPolicyAlgorithm", bound="OptionOffPolicyAlgorithm")
 
 
-def option_space_of(env: GymEnv | str | None) -> OptionSpace | None:
-    """What the options of an environment mean that plays them; None for any other, and where there is none."""
-    if isinstance(env, VecEnv):
-        return env.get_attr("option_space")[0] if env.has_attr("option_space") else None
-    wrapped = unwrap_wrapper(env, OptionExecutionWrapper) if isinstance(env, gym.Env) else None
-    return wrapped.option_space if isinstance(wrapped, OptionExecutionWrapper) else None
-
-
 class OptionOffPolicyAlgorithm(OffPolicyAlgorithm):
     """Stable-Baselines3's ``OffPolicyAlgorithm`` on the semi-Markov decision process of options.
 
@@ -125,8 +117,8 @@ class OptionOffPolicyAlgorithm(OffPolicyAlgorithm):
         d_max: float,
         d_min: float | None,
         dt: float | None,
-        trajectory: str | type[Trajectory] = "rbf",
-        duration_scale: DurationScale = "linear",
+        trajectory: str | type[Trajectory] = "bezier",
+        duration_scale: DurationScale = "log",
         join: Join = "free",
         reward_scale: float | Literal["auto"] = 1.0,
         gamma: float,

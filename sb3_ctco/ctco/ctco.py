@@ -15,7 +15,6 @@ from torch import nn
 
 from sb3_ctco.common.buffers import DictOptionReplayBuffer, OptionReplayBuffer
 from sb3_ctco.common.losses import ENTROPY_REFERENCES, EntropyReference, actor_loss, critic_target, log_reference_density
-from sb3_ctco.common.option_algorithm import option_space_of
 from sb3_ctco.common.soft_actor_critic import SoftOptionActorCritic
 from sb3_ctco.ctco.canonical import CanonicalOptions
 from sb3_ctco.ctco.fast_update import FastUpdate
@@ -26,22 +25,6 @@ from sb3_ctco.options import DurationScale, Join, Trajectory, default_durations,
 def _longest(d_max: float | None, gamma: float, gamma_dt: float) -> float:
     """The longest duration, in s: by default what follows from the discount."""
     return default_durations(discount_rate_from_gamma(gamma, gamma_dt))[1] if d_max is None else d_max
-
-
-def _trajectory_of(
-    trajectory: str | type[Trajectory] | None,
-    duration_scale: DurationScale | None,
-    entropy_reference: EntropyReference,
-    env: GymEnv | str | None = None,
-) -> tuple[str | type[Trajectory], DurationScale]:
-    """How ω becomes actions, and d seconds: by default as in an environment that plays options, else what learns best."""
-    space = option_space_of(env)
-    if trajectory is None:
-        trajectory = "bezier" if space is None else space.arguments["trajectory"]
-    if duration_scale is None:
-        by_default: DurationScale = "linear" if entropy_reference == "paper" else "log"
-        duration_scale = by_default if space is None else space.duration_scale
-    return trajectory, duration_scale
 
 
 class CTCO(SoftOptionActorCritic):
@@ -86,9 +69,8 @@ class CTCO(SoftOptionActorCritic):
         :func:`~sb3_ctco.options.default_durations`
     :param dt: interaction period of the environment, in s; by default found in the environment
     :param trajectory: how ω becomes actions: ``"bezier"``, ``"rbf"``, the paper's radial basis functions, or a subclass of
-        :class:`~sb3_ctco.options.Trajectory`; by default what the environment's wrapper has, ``"bezier"`` if it has none
-    :param duration_scale: ``"log"`` or ``"linear"``, the paper's, see :class:`~sb3_ctco.options.OptionSpace`; by default what
-        the environment's wrapper has, ``"log"`` if it has none (``"linear"`` with ``entropy_reference="paper"``)
+        :class:`~sb3_ctco.options.Trajectory`
+    :param duration_scale: ``"log"`` or ``"linear"``, the paper's, see :class:`~sb3_ctco.options.OptionSpace`
     :param join: where an option's actions begin: wherever its weights say (``"free"``, the paper's way), or at the action that
         is being sent then (``"continuous"``), see :class:`~sb3_ctco.wrappers.OptionExecutionWrapper`
     :param reward_scale: what R is multiplied by for the critics, a number, or ``"auto"`` for a unit that does not depend on
@@ -159,8 +141,8 @@ class CTCO(SoftOptionActorCritic):
         d_max: float | None = None,
         d_min: float | None = None,
         dt: float | None = None,
-        trajectory: str | type[Trajectory] | None = None,
-        duration_scale: DurationScale | None = None,
+        trajectory: str | type[Trajectory] = "bezier",
+        duration_scale: DurationScale = "log",
         join: Join = "free",
         reward_scale: float | Literal["auto"] = 1.0,
         high_freq_penalty: float | Schedule = 0.003,
@@ -186,7 +168,6 @@ class CTCO(SoftOptionActorCritic):
     ):
         if entropy_reference not in ENTROPY_REFERENCES:
             raise ValueError(f"entropy_reference must be one of {ENTROPY_REFERENCES}, not {entropy_reference!r}")
-        trajectory, duration_scale = _trajectory_of(trajectory, duration_scale, entropy_reference, env)
         if entropy_reference == "paper" and duration_scale != "linear":
             raise ValueError(
                 "entropy_reference='paper' is of densities over d in s, so it needs duration_scale='linear', not "
@@ -252,10 +233,7 @@ class CTCO(SoftOptionActorCritic):
         :param arguments: the algorithm's arguments, defaults included
         """
         longest = _longest(arguments["d_max"], arguments["gamma"], arguments["gamma_dt"])
-        names = ("trajectory", "duration_scale", "entropy_reference")
-        trajectory, duration_scale = _trajectory_of(*(arguments[name] for name in names))
-        found = {"d_max": longest, "trajectory": trajectory, "duration_scale": duration_scale}
-        return super().wrapper_kwargs({**arguments, **found})
+        return super().wrapper_kwargs({**arguments, "d_max": longest})
 
     @staticmethod
     def paper_defaults() -> dict[str, Any]:

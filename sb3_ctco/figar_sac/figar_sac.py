@@ -144,6 +144,7 @@ class FiGARSAC(SoftOptionActorCritic):
             d_max=d_max,
             d_min=0.0,
             dt=dt,
+            duration_scale="linear",
             gamma=gamma,
             gamma_dt=gamma_dt,
             updates_per_second=updates_per_second,
