@@ -723,13 +723,14 @@ def play(env, options):
 # With n_rbf = 1 an option is [action, duration]; durations run from 0.02 s (−1) to 0.2 s (1).
 OPTIONS = [(0.5, 1.0), (-0.5, 1.0), (0.25, -1.0), (1.0, 0.0)]
 LENGTHS = [10, 10, 1, 6]
+SETTINGS = {"n_rbf": 1, "d_max": 0.2, "duration_scale": "linear"}
 
 
 @pytest.mark.parametrize("background", [False, True])
 def test_deciding_ahead_plays_the_same_commands_and_counts_each_once(background):
-    plain = OptionExecutionWrapper(Point(), n_rbf=1, d_max=0.2)
+    plain = OptionExecutionWrapper(Point(), **SETTINGS)
     play(plain, OPTIONS)
-    ahead = RealTimeOptionWrapper(Point(), decide_ahead=0.06, background=background, n_rbf=1, d_max=0.2)
+    ahead = RealTimeOptionWrapper(Point(), decide_ahead=0.06, background=background, **SETTINGS)
     transitions = play(ahead, OPTIONS)
     # 10 − 3; the rest of 3 and 10 − 3; the rest of 3 alone; the one of 1 and 6 − 3
     assert [t[4]["option"]["n_steps"] for t in transitions] == [7, 10, 3, 4]
@@ -753,8 +754,8 @@ def test_deciding_ahead_plays_the_same_commands_and_counts_each_once(background)
 
 
 def test_without_decide_ahead_nothing_differs():
-    plain = play(OptionExecutionWrapper(Point(), n_rbf=1, d_max=0.2), OPTIONS)
-    same = play(RealTimeOptionWrapper(Point(), n_rbf=1, d_max=0.2), OPTIONS)
+    plain = play(OptionExecutionWrapper(Point(), **SETTINGS), OPTIONS)
+    same = play(RealTimeOptionWrapper(Point(), **SETTINGS), OPTIONS)
     for one, other in zip(plain, same, strict=True):
         np.testing.assert_array_equal(one[0], other[0])
         assert one[1:4] == other[1:4]
@@ -763,7 +764,7 @@ def test_without_decide_ahead_nothing_differs():
 
 
 def test_the_rest_of_an_option_may_end_the_episode():
-    env = RealTimeOptionWrapper(Point(), decide_ahead=0.1, n_rbf=1, d_max=0.2)
+    env = RealTimeOptionWrapper(Point(), decide_ahead=0.1, **SETTINGS)
     env.reset(seed=0)
     lengths, truncated = [], False
     while not truncated:
@@ -783,7 +784,7 @@ def test_interruption_ends_an_option_with_the_time_that_ran():
         calls.append((float(decided_on[0]), float(obs[0]), seconds))
         return abs(obs[0] - decided_on[0]) > 0.05
 
-    env = RealTimeOptionWrapper(Point(), interrupt=interrupt, n_rbf=1, d_max=0.2)
+    env = RealTimeOptionWrapper(Point(), interrupt=interrupt, **SETTINGS)
     env.reset(seed=0)
     # 0.02 m a step at full speed: the third step passes 0.05 m.
     obs, _, _, _, info = env.step(np.array([1.0, 1.0]))
@@ -800,9 +801,7 @@ def test_interruption_ends_an_option_with_the_time_that_ran():
 
 
 def test_an_interrupted_option_has_no_rest():
-    env = RealTimeOptionWrapper(
-        Point(), decide_ahead=0.06, interrupt=lambda before, obs, seconds: obs[0] > 0.09, n_rbf=1, d_max=0.2
-    )
+    env = RealTimeOptionWrapper(Point(), decide_ahead=0.06, interrupt=lambda before, obs, seconds: obs[0] > 0.09, **SETTINGS)
     transitions = play(env, [(1.0, 1.0), (-1.0, 1.0)])
     assert [t[4]["option"]["n_steps"] for t in transitions] == [5, 7]
     assert env.unwrapped.commands[:6] == [1.0] * 5 + [-1.0]

@@ -174,8 +174,8 @@ def test_paper_entropies_need_the_papers_durations():
 
 def test_the_critics_see_what_is_played(random_walk_env):
     """Of one step the first of two weights is all: options that differ in the other have one value, and no gradient by it."""
-    options = {"n_rbf": 2, "d_max": 0.5, "duration_scale": "linear"}
-    model = make(random_walk_env(), **options, trajectory="bezier", canonical_options=True).learn(40)
+    of_options = {"n_rbf": 2, "d_max": 0.5, "duration_scale": "linear"}
+    model = make(random_walk_env(), **of_options, trajectory="bezier", canonical_options=True).learn(40)
     obs = th.zeros(2, 2)
     # Of one step: up to 0.15 s, which is −0.75 on the way from 0.1 to 0.5 s
     options = th.tensor([[0.3, 0.9, -1.0], [0.3, -0.4, -0.8]], requires_grad=True)
@@ -188,7 +188,7 @@ def test_the_critics_see_what_is_played(random_walk_env):
     th.testing.assert_close(model._as_critics_see(longer), th.tensor([[0.3, 0.9, 0.0]]))
     # Where the shortest option has two steps, weights stay as they are, and so does all.
     for kwargs in ({"d_min": 0.2, "canonical_options": True}, {"canonical_options": False}):
-        assert make(random_walk_env(), **{**options, **kwargs})._as_critics_see(longer) is longer
+        assert make(random_walk_env(), **{**of_options, **kwargs})._as_critics_see(longer) is longer
 
 
 def test_what_was_counted_goes_on_after_loading(tmp_path, random_walk_env):
