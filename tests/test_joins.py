@@ -524,11 +524,12 @@ def test_largest_jump_by_hand():
 
 
 @pytest.mark.slow
-def test_pendulum_is_learned():
+@pytest.mark.parametrize("join", JOINED)
+def test_pendulum_is_learned(join):
     model = CTCO(
         "MlpPolicy",
         "Pendulum-v1",
-        join="continuous",
+        join=join,
         learning_rate=1e-3,
         learning_starts=500,
         batch_size=128,

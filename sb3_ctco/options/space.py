@@ -110,7 +110,7 @@ class OptionSpace:
         """What an option leaves from that begins after each action but the first.
 
         With smooth joins that is the action, and how it was changing: the difference from the one before, where 1 is as steep
-        as an option's actions can be, the whole box ``n_weights + 1`` times in the shortest duration. Steeper ones count as 1.
+        as a Bézier curve can be, the whole box ``n_weights + 1`` times in the shortest duration. What is steeper counts as 1.
 
         :param sent: normalised actions that were sent every dt, ``[n + 1, action_dim]``
         :return: shape ``[n, n_before · action_dim]``
