@@ -1,4 +1,4 @@
-"""What ten demonstrations are worth: CTCO with half of each batch from them, and without.
+"""What ten demonstrations are worth: CTCO with a quarter of each batch from them, and without.
 
     python benchmarks/demonstrations.py --task point_mass --seeds 3
     python benchmarks/demonstrations.py --task visual_reacher --seeds 3
@@ -97,9 +97,10 @@ def record(task: Task, env: gym.Env, seed: int) -> RecordedTrajectory:
     return RecordedTrajectory(stacked, np.array(actions), np.array(rewards, dtype=np.float64), *ended, DT)
 
 
-def run(task: Task, n_demonstrations: int, seed: int, seconds: float, path: Path) -> None:
+def run(task: Task, n_demonstrations: int, fraction: float, seed: int, seconds: float, path: Path) -> None:
     env = task.make()
-    model = CTCO(task.policy, env, seed=seed, **COMMON, **task.arguments)
+    buffer = {"demonstration_fraction": fraction}
+    model = CTCO(task.policy, env, seed=seed, replay_buffer_kwargs=buffer, **COMMON, **task.arguments)
     for k in range(n_demonstrations):
         trajectory = record(task, task.make(), 1000 * seed + k)
         result = model.replay_buffer.add_trajectory(*trajectory)  # type: ignore[union-attr]
@@ -121,6 +122,7 @@ def main() -> None:
     parser.add_argument("--seeds", type=int, default=3)
     parser.add_argument("--seconds", type=float, help="task time of a training")
     parser.add_argument("--demonstrations", type=int, default=10)
+    parser.add_argument("--fraction", type=float, default=0.25, help="part of each batch that is drawn from them")
     parser.add_argument("--parts", type=int, default=6, help="of the training, in the table")
     parser.add_argument("--folder", type=Path, default=Path("runs/demonstrations"))
     args = parser.parse_args()
@@ -133,9 +135,10 @@ def main() -> None:
     for n in (0, args.demonstrations):
         curves = []
         for seed in range(args.seeds):
-            path = args.folder / f"{args.task}_{n}_{seconds:.0f}s_seed{seed}.csv"
+            share = f"_{args.fraction:g}" if n else ""
+                path = args.folder / f"{args.task}_{n}{share}_{seconds:.0f}s_seed{seed}.csv"
             if not path.exists():
-                run(task, n, seed, seconds, path)
+                run(task, n, args.fraction, seed, seconds, path)
             with path.open(newline="") as file:
                 rows = np.array([[float(row["seconds"]), float(row["discounted_return"])] for row in csv.DictReader(file)])
             parts = np.searchsorted(edges, rows[:, 0]) - 1

@@ -1,4 +1,4 @@
-"""Free and continuous joins: returns, jerk and jumps of trained policies, and a picture of their actions.
+"""Free, continuous and smooth joins: returns, jerk and jumps of trained policies, and a picture of their actions.
 
     sb3-ctco study run --preset quick --rates 500 --settings tuned --seeds 0 1 2 --folder runs/study/joins
     sb3-ctco study run --preset benchmarks/joins.yml
@@ -116,7 +116,7 @@ def main() -> None:
     of_figure.add_argument("--task", default="cheetah")
     of_figure.add_argument("--rate", type=int, default=500)
     of_figure.add_argument("--seed", type=int, default=0)
-    of_figure.add_argument("--settings", nargs="+", default=["tuned", "continuous"])
+    of_figure.add_argument("--settings", nargs="+", default=["tuned", "continuous", "smooth"])
     of_figure.add_argument("--seconds", type=float, default=2.0)
     of_figure.add_argument("--output", type=Path, default=Path("joins.png"))
     args = parser.parse_args()

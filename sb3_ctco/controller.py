@@ -45,7 +45,7 @@ METADATA_KEY = "sb3_ctco"
 class OptionPolicy(Protocol):
     """What :class:`OptionController` needs of a policy: a function from observations to options, and their meaning.
 
-    With a continuous join, observations hold the action that is being sent, and the space that they are then in is
+    Unless the join is free, observations hold what an option leaves from, and the space that they are then in is
     ``observation_space``.
     """
 
@@ -266,9 +266,9 @@ class _Execution:
 
     :param n_steps: after how many it is time to decide
     :param plan: its actions at a fixed rate
-    :param weights: ω in the units of the actions, ``[n_rbf, action_dim]``, if they come by a clock; with a continuous join the
-        action before is the first
-    :param sent: the action of the last tick; at a fixed rate, of the one before ``_rows``
+    :param weights: ω in the units of the actions, ``[n_before + n_rbf, action_dim]``, if they come by a clock; unless the join
+        is free, the points that are given are the first
+    :param sent: the actions of the last two ticks, ``[2, *action_shape]``; at a fixed rate, of those before ``_rows``
     :param tick: how many of its ticks have passed
     :param start: when it began, by the caller's clock, in s
     :param checked: after how many steps a ValueInterrupt was asked
@@ -303,7 +303,7 @@ class OptionController:
     Ticks by a clock are real time, and guarded (:class:`~sb3_ctco.safety.Safety`): changes of actions are limited, and the
     safe action takes their place while there is no fresh observation, or when the policy fails, by an exception or by
     numbers that are not finite. That is counted in ``replaced`` and logged, and no exception reaches the loop. Without a new
-    observation pass None. Ticks every ``dt`` are a simulation's, and are not guarded. With a continuous join an option leaves
+    observation pass None. Ticks every ``dt`` are a simulation's, and are not guarded. Unless joins are free, an option leaves
     from what was really sent.
 
     Example:
@@ -357,7 +357,7 @@ class OptionController:
         self._trajectory = self.settings.trajectory
         self._box = ActionBox(self.policy.primitive_action_space.low, self.policy.primitive_action_space.high)
         self._middle = self._box.actions(np.zeros((1, self._box.low.size)))[0]
-        #: What is being sent where no option runs, ``[*action_shape]`` or ``[n, *action_shape]``; None if that is not known
+        #: The last two actions where no option runs, ``[n or 1, 2, *action_shape]``; None if they are not known
         self._first: np.ndarray | None = None
         self._longest = sys.maxsize if replan_period is None else steps_in(replan_period, self.dt)
         self._interrupt = interrupt
@@ -386,18 +386,20 @@ class OptionController:
         """Forget the options that run, so that the next tick decides anew: at the start of each episode.
 
         :param which: with several observations, those to reset: their indices or a mask; all of them by default
-        :param last_action: the action that is being sent, from which the first option leaves with a continuous join; by
+        :param last_action: the action that is being sent, from which the first option leaves unless the join is free; by
             default the middle of the box, as in training
         """
-        first = None if last_action is None else np.asarray(last_action, self._box.low.dtype).reshape(self._box.low.shape)
+        first = None
+        if last_action is not None:
+            first = np.stack([np.asarray(last_action, self._box.low.dtype).reshape(self._box.low.shape)] * 2)
         self.decide_anew(which)
         if which is None:
             self._executions = []
-            self._first = first
+            self._first = None if first is None else first[None]
             self._now = self._sent_at = self._guard = None
             self._observed_at = -math.inf
         for execution in self._chosen(which):
-            execution.sent = self._middle if first is None else first
+            execution.sent = np.stack([self._middle] * 2) if first is None else first
 
     def decide_anew(self, which: Sequence[int] | npt.NDArray[Any] | None = None) -> None:
         """Break the options off that run: the next tick decides anew, on from what is being sent.
@@ -414,13 +416,20 @@ class OptionController:
         return [self._executions[i] for i in np.atleast_1d(np.arange(len(self._executions))[np.asarray(which)])]
 
     def _leave_rows(self) -> None:
-        if self._rows:
-            self._keep_sent(self._rows[self._next - 1])
+        for actions in self._rows[max(self._next - 2, 0) : self._next]:
+            self._keep_sent(actions, self.dt)
         self._rows, self._next = [], 0
 
-    def _keep_sent(self, actions: np.ndarray) -> None:
+    def _keep_sent(self, actions: np.ndarray, seconds: float) -> None:
         for execution, action in zip(self._executions, actions if self._several else [actions], strict=True):
-            execution.sent = action
+            execution.sent = self._last_two(execution.sent, action, seconds)
+
+    def _last_two(self, sent: np.ndarray, action: np.ndarray, seconds: float) -> np.ndarray:
+        """The last two actions, as if they had been sent dt apart.
+
+        :param seconds: how much later than the one before the last was sent
+        """
+        return np.stack([sent[1] + (action - sent[1]) * (1.0 - self.dt / (seconds or self.dt)), action])
 
     def __call__(
         self, observation: Observation | None, now: float | None = None, observed_at: float | None = None
@@ -449,8 +458,9 @@ class OptionController:
                 raise ValueError(f"now must be finite and must not run backwards, and it is {now} s after {self._now} s")
             if self.safety is not None:
                 return self._guarded(observation, now, observed_at)
+            seconds = self.dt if self._now is None else now - self._now
             actions = self._at(observation, now)
-            self._keep_sent(actions)
+            self._keep_sent(actions, seconds)
             return actions
 
         if self._next == len(self._rows):
@@ -482,15 +492,19 @@ class OptionController:
         if self._guard is None or (reason is None and self._guard.low.shape != actions.shape):
             self._guard = Guard(self.safety, np.broadcast_to(low, actions.shape), np.broadcast_to(high, actions.shape))
             self._guard.replaced = self.replaced
-            self._guard.start(None if self._first is None else np.broadcast_to(self._first, actions.shape))
+            shape = (actions.size // low.size, *low.shape)
+            self._guard.start(None if self._first is None else np.broadcast_to(self._first[:, 1], shape))
         seconds = self.dt if self._sent_at is None else now - self._sent_at
         self._now = self._sent_at = now
         command = self._guard.command(actions, seconds, reason=reason)
         if self._guard.is_safe_action:
             # Whatever comes next is decided anew, on from here.
-            self._executions, self._first = [], command
+            commands = command.reshape(-1, *low.shape)
+            before = [e.sent for e in self._executions] or self._firsts(len(commands))
+            self._first = np.stack([self._last_two(*both, seconds) for both in zip(before, commands, strict=True)])
+            self._executions = []
         else:
-            self._keep_sent(command)
+            self._keep_sent(command, seconds)
         return command
 
     def _at(self, observation: Observation | None, now: float) -> np.ndarray:
@@ -501,9 +515,10 @@ class OptionController:
             self._renew(observation, due, [round((now - e.start) / dt) for e in self._executions], now)
         self._now = now
         # The action that an option leaves from is that of the tick before it.
-        lead, basis = (dt, self._trajectory.joined_basis) if self.settings.joined else (0.0, self._trajectory.basis)
+        n_before = self.settings.n_before
+        lead = dt if n_before else 0.0
         phases = np.array([min((now - e.start + lead) / (len(e.plan) * dt), 1.0) for e in self._executions])
-        features = basis(phases)
+        features = self._trajectory.joined_basis(phases, n_before) if n_before else self._trajectory.basis(phases)
         actions = self._box.cast(np.array([row.dot(e.weights) for row, e in zip(features, self._executions, strict=True)]))
         return actions if self._several else actions[0]
 
@@ -536,8 +551,8 @@ class OptionController:
             self._executions[i] = self._begin(option, action, now)
 
     def _firsts(self, n: int) -> list[np.ndarray]:
-        """What n first options leave from."""
-        return list(np.broadcast_to(self._middle if self._first is None else self._first, (n, *self._box.low.shape)))
+        """The two actions before n first options."""
+        return list(np.broadcast_to(self._middle if self._first is None else self._first, (n, 2, *self._box.low.shape)))
 
     def _with_interrupted(self, observation: Observation, due: list[int], ran: list[int]) -> list[int]:
         """Options that are due, and those whose rest is not worth playing.
@@ -551,7 +566,7 @@ class OptionController:
             e.checked = n_ran
             if len(e.plan) - n_ran < shortest_steps(self.settings):
                 continue
-            before = self._box.normalise([e.sent])[0] if self.settings.joined else None
+            before = self._before(e.sent) if self.settings.joined else None
             rests.append(self.settings.closest(self._box.normalise(e.plan[n_ran:]), before)[0])
             asked.append(i)
         if not asked:
@@ -563,16 +578,20 @@ class OptionController:
         return sorted([*due, *(i for i, ends in zip(asked, worth_ending, strict=True) if ends)])
 
     def _ask(self, observation: Observation, sent: list[np.ndarray], several: bool) -> np.ndarray:
-        """Options for one or several observations, and the actions that are being sent."""
+        """Options for one or several observations, and the last two actions before each."""
         return np.asarray(self.policy(self._as_seen(observation, sent, several)))
 
     def _as_seen(self, observation: Observation, sent: list[np.ndarray], several: bool) -> Observation:
         """Observations as the policy sees them."""
         if not self.settings.joined:
             return observation
-        before = self._box.normalise(sent)
+        before = np.stack([self._before(actions) for actions in sent])
         seen: Observation = with_last_action(self.policy.observation_space, observation, before if several else before[0])
         return seen
+
+    def _before(self, sent: np.ndarray) -> np.ndarray:
+        """What an option leaves from, by the last two actions before it."""
+        return self.settings.before(self._box.normalise(sent))[0]
 
     def _are_several(self, observation: Observation) -> bool:
         space: Any = self.policy.observation_space
@@ -586,7 +605,7 @@ class OptionController:
         if not np.isfinite(option).all():
             raise ValueError(f"the policy returned an option that is not finite: {option}")
         omega, n_steps = self.settings.decode(option)
-        start = self._box.normalise([sent])[0] if self.settings.joined else None
+        start = self.settings.first_points(self._before(sent), n_steps) if self.settings.joined else None
         plan = self._box.actions(self._trajectory.plan(omega, n_steps, start))
         # Features sum to one, so that actions are the same combination of weights in their own units.
         weights = self._box.scale(omega.T if start is None else np.vstack([start, omega.T]))

@@ -304,7 +304,7 @@ def test_the_journal_keeps_what_the_replay_buffer_holds(tmp_path):
     assert not (tmp_path / "journal" / "000000.journal").exists()
 
 
-@pytest.mark.parametrize("join", ["free", "continuous"])
+@pytest.mark.parametrize("join", ["free", "continuous", "smooth"])
 def test_sub_options_are_in_the_learners_replay_buffer(tmp_path, join):
     arguments = {"n_sub_options": 4, "d_max": 0.5, "join": join}
     # With random options only, so that both do the same.

@@ -260,7 +260,7 @@ def test_ctco_learns_with_demonstrations_by_fast_updates(random_walk_env, tmp_pa
         learning_starts=20,
         batch_size=32,
         policy_kwargs={"net_arch": [16]},
-        replay_buffer_kwargs={"demonstration_fraction": 0.25},
+        replay_buffer_kwargs={"demonstration_fraction": 0.75},
         buffer_size=500,
         seed=0,
     )
@@ -280,7 +280,7 @@ def test_ctco_learns_with_demonstrations_by_fast_updates(random_walk_env, tmp_pa
     # A loaded model's new buffer knows what options mean, and keeps the share
     fresh = CTCO.load(tmp_path / "model.zip").replay_buffer
     assert fresh.add_trajectory(*walk(random_walk_env(), 0)).added > 10
-    assert fresh.demonstration_fraction == 0.25
+    assert fresh.demonstration_fraction == 0.75
 
 
 def test_without_demonstrations_batches_are_what_they_were():
@@ -380,24 +380,25 @@ def test_lerobot_datasets_are_read(tmp_path, one_file_an_episode):
         next(lerobot_trajectories(tmp_path / "data"))
 
 
-@pytest.mark.parametrize("kind", ["vector", "dict"])
-def test_with_a_continuous_join_stretches_leave_from_the_action_before_them(kind):
-    space = OptionSpace.make(2, 0.5, 0.1, 0.1, TAU, "bezier", join="continuous")
+@pytest.mark.parametrize(("kind", "join"), [("vector", "continuous"), ("dict", "continuous"), ("dict", "smooth")])
+def test_stretches_leave_from_the_action_before_them(kind, join):
+    space = OptionSpace.make(2, 0.5, 0.1, 0.1, TAU, "bezier", join=join)
     bare = STEPS if kind == "vector" else spaces.Dict({"q": STEPS})
-    buffer = make_buffer(space=with_last_action_space(bare, 2))
+    buffer = make_buffer(space=with_last_action_space(bare, 2 * space.n_before))
     buffer.option_space = space
     observations, actions, rewards = recording(40)
     added = buffer.add_trajectory(
         observations if kind == "vector" else {"q": observations}, actions, rewards, False, True, 0.1
     )
     assert added.added > 30
-    sent = np.vstack([np.zeros(2), actions / [2.0, 0.5] - [0.0, 1.0]])
+    sent = np.vstack([np.zeros((2, 2)), actions / [2.0, 0.5] - [0.0, 1.0]])
+    before, sent = space.before(sent), sent[1:]
     for row in demonstrations(buffer):
         stored = buffer.observations if kind == "vector" else buffer.observations["q"]
         first = int(stored[row, 0, 0])
         last = buffer.observations[row, 0, 1:] if kind == "vector" else buffer.observations["last_action"][row, 0]
-        np.testing.assert_allclose(last, sent[first], atol=1e-6)
-        plan = space.plan(buffer.actions[row, 0].astype(np.float64), sent[first])
+        np.testing.assert_allclose(last, before[first], atol=1e-6)
+        plan = space.plan(buffer.actions[row, 0].astype(np.float64), before[first])
         assert np.abs(plan - sent[first + 1 : first + 1 + len(plan)]).max() <= added.largest_residual + 1e-6
     with pytest.raises(ValueError, match="n actions, n rewards and n \\+ 1 observations"):
         wrong = observations[:-1] if kind == "vector" else {"q": observations[:-1]}

@@ -46,6 +46,7 @@ def plain(model):
         {"n_rbf": 3, "d_max": 0.15},
         {"n_rbf": 3, "d_max": 0.15, "canonical_options": True},
         {"n_rbf": 3, "d_max": 0.15, "canonical_options": True, "join": "continuous"},
+        {"n_rbf": 3, "d_max": 0.15, "canonical_options": True, "join": "smooth"},
         {"n_rbf": 3, "d_max": 0.3, "duration_scale": "log", "trajectory": "bezier", "canonical_options": True},
     ],
 )

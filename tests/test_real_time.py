@@ -271,8 +271,9 @@ def test_what_a_sub_option_stands_for_was_played_so_much_later(scripted_env):
         np.testing.assert_allclose(played, 0.5, rtol=1e-6)  # as far as it was played until now
 
 
+@pytest.mark.parametrize("join", ["continuous", "smooth"])
 @pytest.mark.parametrize("ahead", [0, 3])
-def test_with_continuous_joins_sub_options_leave_from_the_action_before_them(scripted_env, ahead):
+def test_sub_options_leave_from_the_action_before_them(scripted_env, ahead, join):
     """The one that is being sent when they begin to play, ``ahead`` steps after their observation."""
     env = RealTimeOptionWrapper(
         scripted_env(),
@@ -283,7 +284,7 @@ def test_with_continuous_joins_sub_options_leave_from_the_action_before_them(scr
         duration_scale="linear",
         n_sub_options=8,
         sub_option_tolerance=2.0,
-        join="continuous",
+        join=join,
     )
     env.reset(seed=0)
     rng = np.random.default_rng(0)
@@ -294,11 +295,13 @@ def test_with_continuous_joins_sub_options_leave_from_the_action_before_them(scr
         assert k > 0 or not ahead or not len(sub)
         found += zip(sub.observations, sub.next_observations, sub.options.astype(np.float64), sub.residuals, strict=True)
     env.step([0.0, 0.0, -1.0])  # sends the rest
-    sent = np.concatenate([[0.0], np.ravel(env.unwrapped.actions)])
+    sent = np.concatenate([[0.0, 0.0], np.ravel(env.unwrapped.actions)])
+    before = env.option_space.before(sent[:, None])
     assert len(found) > 50
     for one, after, option, residual in found:
         first, end = int(one[0]) + ahead, int(after[0]) + ahead
-        assert (one[-1], after[-1]) == pytest.approx((sent[first], sent[end]), abs=1e-6)
-        again = env.option_space.plan(option, one[-1:].astype(np.float64))[:, 0]
-        assert np.abs(again - sent[first + 1 : end + 1]).max() == pytest.approx(residual, abs=2e-6)
-        assert residual < 1e-5
+        np.testing.assert_allclose(one[2:], before[first], atol=1e-6)
+        np.testing.assert_allclose(after[2:], before[end], atol=1e-6)
+        again = env.option_space.plan(option, one[2:].astype(np.float64))[:, 0]
+        assert np.abs(again - sent[first + 2 : end + 2]).max() == pytest.approx(residual, abs=2e-6)
+        assert residual < {"continuous": 1e-5, "smooth": 0.2}[join]

@@ -8,7 +8,7 @@ import pytest
 from gymnasium import spaces
 
 from sb3_ctco import OptionController
-from sb3_ctco.options import OptionSpace
+from sb3_ctco.options import JOINS, OptionSpace
 from sb3_ctco.safety import Guard, Safety
 from sb3_ctco.wrappers import OptionExecutionWrapper, RealTimeOptionWrapper, RealTimeWrapper
 
@@ -350,7 +350,7 @@ def test_the_rest_of_an_option_is_told_from_what_was_sent():
 
 
 @pytest.mark.parametrize("ahead", [0.0, 0.2])
-@pytest.mark.parametrize("join", ["free", "continuous"])
+@pytest.mark.parametrize("join", JOINS)
 def test_an_option_that_is_not_finite(ahead, join):
     machine = Machine()
     env = RealTimeWrapper(machine, clock=Clock(), safety=Safety(safe_action="hold", **UNLIMITED))
@@ -360,13 +360,15 @@ def test_an_option_that_is_not_finite(ahead, join):
     for _ in range(2):
         obs, *_, info = env.step([np.nan, 1.0])
         assert info["taken_over"]
-        if join == "continuous":
-            assert obs[-1] == 0.5
+        if join != "free":
+            assert obs[1] == 0.5
+    if join == "smooth":
+        assert obs[2] == 0.0
     *_, info = env.step([0.25, 1.0])
     env.close()
     assert np.isfinite(machine.commands).all()
     assert machine.commands[9:12] == [0.5] * 3
-    assert machine.commands[12] == (0.25 if join == "free" else 0.475)
+    assert machine.commands[12] == pytest.approx({"free": 0.25, "continuous": 0.475, "smooth": 0.4975}[join])
     assert "taken_over" not in info
     assert env.get_wrapper_attr("total_statistics").safe_ticks == 2
     unguarded = RealTimeOptionWrapper(RealTimeWrapper(Machine(), clock=Clock(), safety=None), n_rbf=1, d_max=1.0)

@@ -80,6 +80,15 @@ def test_deciding_ahead(scripted_env):
     assert len(recorded[0].actions) == 6
 
 
+def test_with_a_smooth_join_control_comes_back_with_the_slope_at_which_it_was_given(scripted_env):
+    env, _ = make_env(scripted_env, lambda obs: [0.1 * obs[0] - 0.5] if 4 <= obs[0] < 8 else None, join="smooth")
+    env.step([0.25, 1.0])
+    obs, *_ = env.step([0.25, 1.0])
+    # By 0.1 a step to 0.2; as steep as an option gets is 4 in the shortest duration.
+    np.testing.assert_allclose(obs[2:], [0.2, 0.1 / (4 * 0.1 / env.option_space.d_min)], atol=1e-6)
+    np.testing.assert_allclose(env.plan([0.25, 1.0])[0, 0], 0.81 * 0.2 + 0.18 * 0.7 + 0.01 * 0.25, atol=1e-6)
+
+
 def test_with_a_continuous_join_control_comes_back_where_it_was_given(scripted_env):
     env, _ = make_env(scripted_env, between(4, 8), join="continuous")
     for last_action in (0.1, -0.5):

@@ -39,7 +39,7 @@ from sb3_ctco.wrappers.checks import check_observation, is_finite, reset_env
 from sb3_ctco.wrappers.step_sequence import SequenceResult, StepSequence, find_step_sequence
 from sb3_ctco.wrappers.timing import find_dt
 
-#: Where the loop over ``step`` leaves what it observed on the way, and the actions sent just before, so that an environment's
+#: Where the loop over ``step`` leaves what it observed on the way, and the actions that were sent, so that an environment's
 #: own infos stay
 ON_THE_WAY = "_observations_on_the_way"
 
@@ -87,10 +87,11 @@ class OptionExecutionWrapper(gym.Wrapper, RecordConstructorArgs):
         actions count as normalised to [−1, 1]
     :param trajectory: how ω becomes actions, a name in ``sb3_ctco.options.TRAJECTORIES`` or a class
     :param duration_scale: ``"log"`` or ``"linear"``, see :class:`~sb3_ctco.options.OptionSpace`
-    :param join: ``"free"``, or ``"continuous"``: an option leaves from the action that is being sent when it begins. That
-        action, normalised, is then part of the observation (:mod:`sb3_ctco.options.joins`); an episode begins with the middle
-        of the box. Where the environment's info has a ``"last_action"``, after ``reset`` or after a step in which something
-        else was sent than it was given, that is taken, in the environment's units
+    :param join: ``"free"``; ``"continuous"``: an option leaves from the action that is being sent when it begins; or
+        ``"smooth"``: there, and with the slope at which actions were changing. What it leaves from, normalised, is then part
+        of the observation (:mod:`sb3_ctco.options.joins`); an episode begins with the middle of the box, at rest. Where the
+        environment's info has a ``"last_action"``, after ``reset`` or after a step in which something else was sent than it
+        was given, that is taken, in the environment's units
     :raises TypeError: if the action space is not a ``Box``
     :raises ValueError: if its bounds are not finite, a setting is out of range, or dt is not given and not found
     """
@@ -161,11 +162,14 @@ class OptionExecutionWrapper(gym.Wrapper, RecordConstructorArgs):
         option_dim = space.low.size * n_rbf + 1
         self.action_space = spaces.Box(-1.0, 1.0, (option_dim,), np.float32)
         if self.option_space.joined:
-            self.observation_space = with_last_action_space(env.observation_space, space.low.size)
+            n_numbers = self.option_space.n_before * space.low.size
+            self.observation_space = with_last_action_space(env.observation_space, n_numbers)
         #: The actions of the last option that ran, in the inner environment's units, ``[n_ran, *action_shape]``
         self.played = np.empty((0, *space.shape), space.dtype)
-        #: What an option leaves from, normalised; None with a free join
-        self._last_action: np.ndarray | None = None
+        #: What an option leaves from, ``[n_before · action_dim]``; None with a free join
+        self._before: np.ndarray | None = None
+        #: The last two actions of which that tells, normalised
+        self._last_two = np.zeros((2, space.low.size))
         self._play: StepSequence | None = None
 
         self.n_sub_options = 0
@@ -190,10 +194,11 @@ class OptionExecutionWrapper(gym.Wrapper, RecordConstructorArgs):
         if not self.option_space.joined:
             return result
         obs, info = result
-        self._last_action = np.zeros(self._box.low.size)
+        self._last_two = np.zeros((2, self._box.low.size))
         if LAST_ACTION in info:
-            self._last_action = self._box.normalise([info[LAST_ACTION]])[0].clip(-1.0, 1.0)
-        return with_last_action(self.observation_space, obs, self._last_action), info
+            self._last_two = self._box.normalise([info[LAST_ACTION]] * 2).clip(-1.0, 1.0)
+        self._before = self.option_space.before(self._last_two)[-1]
+        return with_last_action(self.observation_space, obs, self._before), info
 
     def _choose_play(self) -> StepSequence:
         """What plays an option's actions until the episode ends."""
@@ -228,31 +233,32 @@ class OptionExecutionWrapper(gym.Wrapper, RecordConstructorArgs):
         play, self._play = self._play, None
 
         space = self.option_space
-        before = self._last_action
+        before = self._before
         trajectory = space.plan(option.clip(-1.0, 1.0), before)
         n_steps = len(trajectory)
         stretches = self._draw_stretches(n_steps)
         observe = sorted({k for ends in stretches for k in ends} - {0, n_steps})
         actions = self._box.actions(trajectory)
         obs, rewards, terminated, truncated, info = self._checked(play, actions, observe)
-        on_the_way: list[tuple[Any, Any]] = []
-        if observe and ON_THE_WAY in info:
-            on_the_way = info.pop(ON_THE_WAY)
-        elif observe:
-            on_the_way = list(zip(info.pop("observations", []), (actions[k - 1] for k in observe), strict=False))
+        n_ran = len(rewards)
+        self.played = actions[:n_ran]
+        if ON_THE_WAY in info:
+            on_the_way, sent = info.pop(ON_THE_WAY)
+        else:
+            on_the_way = list(info.pop("observations", []))[: len(observe)] if observe else []
+            sent = [*actions[: n_ran - 1], info[LAST_ACTION]] if LAST_ACTION in info else actions[:n_ran]
         # Stacked, they are copies, too: the environment may overwrite its own.
-        seen = stack([self._last_obs, *(one for one, _ in on_the_way), obs]) if self.n_sub_options else None
+        seen = stack([self._last_obs, *on_the_way, obs]) if self.n_sub_options else None
         if on_the_way and not is_finite(seen):
             raise ValueError(f"the environment {self.env} returned an observation that is not finite: {seen}")
         if not (terminated or truncated):
             self._play = play
 
-        n_ran = len(rewards)
-        last_action = self._keep_played(actions[:n_ran], info)
         if before is not None:
-            sent = self._box.normalise([*(action for _, action in on_the_way), last_action]).clip(-1.0, 1.0)
-            self._last_action = sent[-1]
-            obs = with_last_action(self.observation_space, obs, self._last_action)
+            since = np.vstack([self._last_two, self._box.normalise(sent).clip(-1.0, 1.0)])
+            self._last_two, befores = since[-2:], space.before(since)
+            self._before = befores[-1]
+            obs = with_last_action(self.observation_space, obs, self._before)
         integral = integrated_reward(rewards, space.dt, space.discount_rate, self.reward_unit)
         info["option"] = OptionInfo(
             duration=n_ran * space.dt,
@@ -264,7 +270,7 @@ class OptionExecutionWrapper(gym.Wrapper, RecordConstructorArgs):
             steps = [0, *observe[: len(on_the_way)], n_ran]
             self._last_obs = rows_of(seen, -1)
             if before is not None:
-                before = np.vstack([before, sent])
+                before = befores[[*steps[:-1], -1]]
                 seen = with_last_action(self.observation_space, seen, before)
             played, ended = (trajectory, rewards, stretches, steps, seen), (terminated, truncated)
             info["sub_options"] = sub_options(space, *played, *ended, self.reward_unit, self.sub_option_tolerance, before)
@@ -284,18 +290,13 @@ class OptionExecutionWrapper(gym.Wrapper, RecordConstructorArgs):
     def _draw_stretches(self, n_steps: int) -> list[tuple[int, int]]:
         return draw_stretches(self._stretch_rng, self.n_sub_options, n_steps, shortest_steps(self.option_space))
 
-    def _keep_played(self, actions: np.ndarray, info: dict[str, Any]) -> np.ndarray:
-        """Keep the actions that were played, and tell the one that the next option leaves from."""
-        self.played = actions
-        return np.asarray(info.get(LAST_ACTION, actions[-1]))
-
     def plan(self, option: npt.ArrayLike) -> np.ndarray:
         """All primitive actions of an option that begins now, in the inner environment's units.
 
         :param option: shape ``[action_dim · n_rbf + 1]``
         :return: shape ``[n_steps, *action_shape]``
         """
-        return self._box.actions(self.option_space.plan(np.clip(plain(option), -1.0, 1.0), self._last_action))
+        return self._box.actions(self.option_space.plan(np.clip(plain(option), -1.0, 1.0), self._before))
 
     def _checked(
         self, play: StepSequence, actions: np.ndarray, observe: Sequence[int]
@@ -327,18 +328,22 @@ class OptionExecutionWrapper(gym.Wrapper, RecordConstructorArgs):
     def _step_in_a_loop(self, actions: np.ndarray, observe: Sequence[int] = ()) -> SequenceResult:
         rewards: list[float] = []
         on_the_way = []
+        joined = self.option_space.joined
+        sent = actions.astype(np.float64) if joined else actions
         step = self.env.step
         # In stretches between the observations that are wanted, so that a step costs nothing more.
         for first, last in itertools.pairwise((0, *observe, len(actions))):
             for action in actions[first:last]:
                 obs, reward, terminated, truncated, info = step(action)
                 rewards.append(reward)  # type: ignore[arg-type]
+                if joined and LAST_ACTION in info:
+                    sent[len(rewards) - 1] = info[LAST_ACTION]
                 if terminated or truncated:
                     break
             if terminated or truncated:
                 break
             if last < len(actions):
-                on_the_way.append(deepcopy((obs, info.get(LAST_ACTION, action))))
-        if observe:
-            info[ON_THE_WAY] = on_the_way
+                on_the_way.append(deepcopy(obs))
+        if observe or joined:
+            info[ON_THE_WAY] = on_the_way, sent[: len(rewards)]
         return obs, rewards, terminated, truncated, info

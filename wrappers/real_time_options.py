@@ -40,8 +40,9 @@ class RealTimeOptionWrapper(OptionExecutionWrapper):
     option before, then the new one without its rest. Its duration and rewards are exactly those of that time, so
     nothing is counted twice or late; but the state at a decision does not tell which rest is still to play. The policy
     sees the state of ``decide_ahead`` seconds before its option begins, and the process is a semi-Markov process only
-    as far as that does not matter. The first option of an episode begins at once. With a continuous join an option leaves from
-    the end of that rest, and the observation holds the action there: what is commanded, since a guard has not limited it yet.
+    as far as that does not matter. The first option of an episode begins at once. Unless the join is free, an option leaves
+    from the end of that rest, and the observation holds the action there: what is commanded, since a guard has not limited it
+    yet.
 
     With ``interrupt``, a function that is called after each primitive step, an option ends as soon as it says so; or as soon
     as a :class:`~sb3_ctco.options.ValueInterrupt` does, which is asked every ``check_period`` and told the rest of the plan.
@@ -83,6 +84,8 @@ class RealTimeOptionWrapper(OptionExecutionWrapper):
         self._executor = ThreadPoolExecutor(1, thread_name_prefix="option") if background else None
         self._rest: np.ndarray | None = None
         self._commands: list[np.ndarray] = []
+        #: What was sent, and before it the last two actions that were sent before
+        self._sent: list[np.ndarray] = []
         self._playing_rest: Future[SequenceResult] | None = None
         self._abandoned = False
         self._decided_on: Any = None
@@ -137,6 +140,7 @@ class RealTimeOptionWrapper(OptionExecutionWrapper):
         self._abandoned = False
         result = super().reset(seed=seed, options=options)
         self._commands = []
+        self._sent = list(self._box.actions(self._last_two))
         self._decided_on = self._last_obs
         return result
 
@@ -144,9 +148,10 @@ class RealTimeOptionWrapper(OptionExecutionWrapper):
         """Play one option, or what is due of it and of the one before."""
         option: FloatArray = np.asarray(plain(action), dtype=np.float64)
         self._is_lost = self._is_guarded and not np.isfinite(option).all()
-        before = self._last_action
+        before = self._before
         # In place of one that is lost the shortest one, whose actions the guard replaces.
         result = super().step(np.full_like(option, -1.0) if self._is_lost else option)
+        self.played = self._played
         info = result[4]
         if self._is_lost:
             info[TAKEN_OVER] = True
@@ -180,10 +185,6 @@ class RealTimeOptionWrapper(OptionExecutionWrapper):
         n_rest = 0 if self._rest is None else len(self._rest)
         return super()._draw_stretches(n_steps) if n_rest == self._ahead_steps <= n_steps else []
 
-    def _keep_played(self, actions: np.ndarray, info: dict[str, Any]) -> np.ndarray:
-        last = super()._keep_played(self._played, info)
-        return last if self._rest is None else self._rest[-1]
-
     def _play_around_decisions(self, plan: np.ndarray, observe: Sequence[int] = ()) -> SequenceResult:
         rest = self._finish_rest()
         if self._is_lost:
@@ -202,12 +203,13 @@ class RealTimeOptionWrapper(OptionExecutionWrapper):
         self._decided_on = result[0]
         self._played, self._commands = np.array(self._commands), []
         # A sub-option that was decided on after k steps of this time would play as this option does from its step k on.
-        on_the_way = result[4].pop(ON_THE_WAY)
-        if observe:
-            n_ran = len(np.asarray(result[1]))
-            seen = [(k, *on_the_way[k - 1]) for k in observe if k < n_ran]
-            # With decide_ahead it would leave from an action that was still to be sent then.
-            result[4][ON_THE_WAY] = [(obs, plan[k - 1] if self._ahead_steps else sent) for k, obs, sent in seen]
+        on_the_way, n_ran = result[4][ON_THE_WAY], len(np.asarray(result[1]))
+        seen = [on_the_way[k - 1] for k in observe if k < n_ran]
+        sent, self._sent = self._sent[2:], self._sent[-2:]
+        if self._ahead_steps:
+            # It would leave from an action that was still to be sent then, as the next option does, unless there is no rest.
+            sent = [*plan, *self._sent] if over or n_now == len(plan) else list(plan)
+        result[4][ON_THE_WAY] = seen, sent
         if not over and n_now < len(plan):
             self._rest = plan[n_now:]
             if self._executor is not None:
@@ -223,25 +225,25 @@ class RealTimeOptionWrapper(OptionExecutionWrapper):
 
     def _play_until_interrupted(self, actions: np.ndarray, steps_before: int = 0) -> SequenceResult:
         rewards: list[Any] = []
-        on_the_way: list[tuple[Any, Any]] = []
+        on_the_way = []
         for action in actions:
             if self._abandoned:
                 raise ResetNeeded("playing was abandoned: call reset() first")
             self._commands.append(action)
             obs, reward, terminated, truncated, info = self.env.step(action)
             rewards.append(reward)
-            sent = info.get(LAST_ACTION, action)
+            self._sent.append(np.array(info.get(LAST_ACTION, action), np.float64))
             if self.n_sub_options:
                 # All of them, because those of a rest are chosen after it.
-                on_the_way.append(deepcopy((obs, sent)))
+                on_the_way.append(deepcopy(obs))
             if terminated or truncated or info.get("interrupted"):
                 break
-            if self._interrupt is not None and self._is_interrupted(obs, sent, actions, len(rewards), steps_before):
+            if self._interrupt is not None and self._is_interrupted(obs, actions, len(rewards), steps_before):
                 info = {**info, "interrupted": True}
                 break
         return obs, rewards, terminated, truncated, {**info, ON_THE_WAY: on_the_way}
 
-    def _is_interrupted(self, obs: Any, sent: Any, actions: np.ndarray, n_ran: int, steps_before: int) -> bool:
+    def _is_interrupted(self, obs: Any, actions: np.ndarray, n_ran: int, steps_before: int) -> bool:
         if self._check_steps is None:
             assert callable(self._interrupt)
             return self._interrupt(self._decided_on, obs, (steps_before + n_ran) * self.option_space.dt)
@@ -250,7 +252,7 @@ class RealTimeOptionWrapper(OptionExecutionWrapper):
         assert isinstance(self._interrupt, ValueInterrupt)
         before = None
         if self.option_space.joined:
-            before = self._box.normalise([sent])[0].clip(-1.0, 1.0)
+            before = self.option_space.before(self._box.normalise(self._sent[-2:]).clip(-1.0, 1.0))[0]
             obs = with_last_action(self.observation_space, obs, before)
         rest, _ = self.option_space.closest(self._box.normalise(actions[n_ran:]), before)
         return bool(self._interrupt.worth_ending(stack([obs]), rest[None])[0])

@@ -63,7 +63,7 @@ class _OptionStorage(ReplayBuffer):
         handle_timeout_termination: bool = True,
         discount_rate: float = DEFAULT_DISCOUNT_RATE,
         reward_scale: float | Literal["auto"] = 1.0,
-        demonstration_fraction: float = 0.5,
+        demonstration_fraction: float = 0.25,
         option_space: OptionSpace | None = None,
         primitive_action_space: spaces.Box | None = None,
     ):
@@ -183,9 +183,9 @@ class _OptionStorage(ReplayBuffer):
         ``demonstration_fraction`` of each batch is drawn from them. Nothing is stored if anything is wrong.
 
         Options are in seconds, so the trajectory may have been recorded at another rate than the environment's. A stretch
-        is of whole recorded steps: where these are longer than d_min, no option is shorter than one of them. With a continuous
-        join a stretch leaves from the action before it, which is put into the observations here; the first leaves from the
-        middle of the box.
+        is of whole recorded steps: where these are longer than d_min, no option is shorter than one of them. Unless joins are
+        free, a stretch leaves from the action before it, which is put into the observations here; the first leaves from the
+        middle of the box, at rest.
 
         :param observations: ``[n + 1, *observation_shape]``, in the end the one after the last action; or a dictionary of such
         :param actions: in the units of the environment, ``[n, *action_shape]``
@@ -225,7 +225,7 @@ class _OptionStorage(ReplayBuffer):
         sent = None
         if space.joined:
             # As an episode begins: with the middle of the box
-            sent = np.vstack([np.zeros((1, plan.shape[1])), plan])
+            sent = space.before(np.vstack([np.zeros((2, plan.shape[1])), plan]))
             observations = with_last_action(self.observation_space, observations, sent)
         seen = _recorded(observations, self.observation_space)
 

@@ -67,7 +67,7 @@ class OptionOffPolicyAlgorithm(OffPolicyAlgorithm):
     :param dt: the environment's interaction period, in s; by default found in the environment
     :param trajectory: how ω becomes actions, a name in ``sb3_ctco.options.TRAJECTORIES`` or a class
     :param duration_scale: ``"log"`` or ``"linear"``, see :class:`~sb3_ctco.options.OptionSpace`
-    :param join: ``"free"`` or ``"continuous"``, see :class:`~sb3_ctco.wrappers.OptionExecutionWrapper`
+    :param join: ``"free"``, ``"continuous"`` or ``"smooth"``, see :class:`~sb3_ctco.wrappers.OptionExecutionWrapper`
     :param reward_scale: what R is multiplied by for the critics, or ``"auto"``, see
         :class:`~sb3_ctco.common.buffers.OptionReplayBuffer`
     :param gamma: discount factor over ``gamma_dt`` seconds, in (0, 1]

@@ -20,7 +20,7 @@ class CanonicalOptions:
 
     def __init__(self, space: OptionSpace, device: th.device | str):
         self._space = space
-        self._matrices = th.as_tensor(space.trajectory.canonical(space.joined), dtype=th.float32, device=device)
+        self._matrices = th.as_tensor(space.trajectory.canonical(space.n_before), dtype=th.float32, device=device)
         n_steps = np.arange(1, steps_in(space.d_max, space.dt) + 1)
         no_weights = np.empty((len(n_steps), 0, space.trajectory.n_weights))
         self._durations = th.as_tensor(space.encode(no_weights, n_steps)[:, -1], device=device)

@@ -71,8 +71,9 @@ class CTCO(SoftOptionActorCritic):
     :param trajectory: how ω becomes actions: ``"bezier"``, ``"rbf"``, the paper's radial basis functions, or a subclass of
         :class:`~sb3_ctco.options.Trajectory`
     :param duration_scale: ``"log"`` or ``"linear"``, the paper's, see :class:`~sb3_ctco.options.OptionSpace`
-    :param join: where an option's actions begin: wherever its weights say (``"free"``, the paper's way), or at the action that
-        is being sent then (``"continuous"``), see :class:`~sb3_ctco.wrappers.OptionExecutionWrapper`
+    :param join: where an option's actions begin: wherever its weights say (``"free"``, the paper's way), at the action that
+        is being sent then (``"continuous"``), or there and at the slope at which actions were changing (``"smooth"``), see
+        :class:`~sb3_ctco.wrappers.OptionExecutionWrapper`
     :param reward_scale: what R is multiplied by for the critics, a number, or ``"auto"`` for a unit that does not depend on
         that of rewards, in which the best option before learning, if it were repeated forever, is worth 100. β_h and
         temperatures are in the unit of what results

@@ -1,4 +1,6 @@
-"""Observations that hold the action that is being sent, from which an option with a continuous join leaves.
+"""Observations that hold what an option leaves from unless its join is free: the action that is being sent.
+
+With a smooth join that is followed by how it was changing (:meth:`sb3_ctco.options.OptionSpace.before`).
 
 A vector of floating-point numbers gets it at its end, a dictionary an entry of its own; anything else, an image for
 instance, becomes a dictionary of two entries.
@@ -17,19 +19,19 @@ LAST_ACTION = "last_action"
 OBSERVATION = "observation"
 
 
-def with_last_action_space(space: spaces.Space, action_dim: int) -> spaces.Space:
+def with_last_action_space(space: spaces.Space, n_numbers: int) -> spaces.Space:
     """The space of observations that hold the last action.
 
     :param space: the environment's, of observations without it
-    :param action_dim: number of entries of an action
+    :param n_numbers: how many tell what an option leaves from, ``n_before · action_dim``
     :raises ValueError: if the environment's own observations have an entry of that name
     """
-    actions = spaces.Box(-1.0, 1.0, (action_dim,), np.float32)
+    actions = spaces.Box(-1.0, 1.0, (n_numbers,), np.float32)
     if isinstance(space, spaces.Dict):
         if LAST_ACTION in space.spaces:
             raise ValueError(
-                f"join='continuous' adds the entry {LAST_ACTION!r} to observations, and the environment's have one of that "
-                "name: rename it, or pass join='free'"
+                f"a join that is not free adds the entry {LAST_ACTION!r} to observations, and the environment's have one of "
+                "that name: rename it, or pass join='free'"
             )
         return spaces.Dict({**space.spaces, LAST_ACTION: actions})
     if isinstance(space, spaces.Box) and len(space.shape) == 1 and np.issubdtype(space.dtype, np.floating):
@@ -43,7 +45,7 @@ def with_last_action(space: spaces.Space, observation: Any, action: FloatArray) 
 
     :param space: of :func:`with_last_action_space`
     :param observation: the environment's, ``[*shape]`` or ``[n, *shape]``, or a dictionary of such
-    :param action: normalised, ``[action_dim]`` or ``[n, action_dim]``
+    :param action: what an option leaves from, ``[n_numbers]`` or ``[n, n_numbers]``
     """
     action = action.clip(-1.0, 1.0)  # rounding
     if isinstance(space, spaces.Box):

@@ -12,8 +12,9 @@ from sb3_ctco.options.trajectory import TRAJECTORIES, Trajectory
 
 DurationScale = Literal["log", "linear"]
 DURATION_SCALES: tuple[DurationScale, ...] = ("log", "linear")
-Join = Literal["free", "continuous"]
-JOINS: tuple[Join, ...] = ("free", "continuous")
+Join = Literal["free", "continuous", "smooth"]
+#: Each at the index of how many of its first points an option is given by what was sent before it
+JOINS: tuple[Join, ...] = ("free", "continuous", "smooth")
 
 
 def default_durations(discount_rate: float) -> tuple[float, float]:
@@ -42,8 +43,8 @@ class OptionSpace:
     :param discount_rate: τ, in 1/s
     :param duration_scale: how [−1, 1] maps to [d_min, d_max]: ``"linear"`` is the paper's, with ``"log"`` equal steps
         multiply the duration, so that short ones are as easy to tell apart as long ones whatever ``d_max`` is
-    :param join: where an option's actions begin: ``"free"``, wherever its weights say, or ``"continuous"``, at the action that
-        is being sent when it begins
+    :param join: where an option's actions begin: ``"free"``, wherever its weights say; ``"continuous"``, at the action that
+        is being sent when it begins; or ``"smooth"``, there, and with the slope at which actions were changing
     :raises ValueError: if a setting is out of its range
     """
 
@@ -98,7 +99,42 @@ class OptionSpace:
     @property
     def joined(self) -> bool:
         """Whether an option leaves from the action that is being sent when it begins."""
-        return self.join == "continuous"
+        return self.n_before > 0
+
+    @property
+    def n_before(self) -> int:
+        """How many numbers an action dimension tell what an option leaves from: an action, and a slope."""
+        return JOINS.index(self.join)
+
+    def before(self, sent: FloatArray) -> FloatArray:
+        """What an option leaves from that begins after each action but the first.
+
+        With smooth joins that is the action, and how it was changing: the difference from the one before, where 1 is as steep
+        as a Bézier curve can be, the whole box ``n_weights + 1`` times in the shortest duration. What is steeper counts as 1.
+
+        :param sent: normalised actions that were sent every dt, ``[n + 1, action_dim]``
+        :return: shape ``[n, n_before · action_dim]``
+        """
+        if self.join != "smooth":
+            return sent[1:]
+        steepest = 2.0 * (self.trajectory.n_weights + 1) / self.d_min
+        return np.hstack([sent[1:], (np.diff(sent, axis=0) / (steepest * self.dt)).clip(-1.0, 1.0)])
+
+    def first_points(self, before: FloatArray, n_steps: Any) -> FloatArray:
+        """The points of a trajectory that are given, of one option or several.
+
+        With smooth joins the second is where the slope leads to in ``1 / (n_weights + 1)`` of the duration, in the box.
+
+        :param before: what it leaves from, see :meth:`before`, shape ``[*n, n_before · action_dim]``
+        :param n_steps: how many steps it takes, shape ``[*n]``
+        :return: shape ``[*n, n_before, action_dim]``
+        """
+        points = before.reshape(*before.shape[:-1], self.n_before, before.shape[-1] // self.n_before)
+        if self.join == "smooth":
+            action, slope = points[..., 0, :], points[..., 1, :]
+            then = action + slope * (2.0 * self.dt / self.d_min) * np.asarray(n_steps)[..., None]
+            points = np.stack([action, then.clip(-1.0, 1.0)], axis=-2)
+        return points
 
     @property
     def arguments(self) -> dict[str, Any]:
@@ -161,25 +197,26 @@ class OptionSpace:
         """The option that comes closest to a plan.
 
         :param plan: normalised actions, shape ``[n_steps, action_dim]``
-        :param before: with a continuous join the action from which it leaves, normalised, shape ``[action_dim]``
+        :param before: what it leaves from unless the join is free, see :meth:`before`
         :return: the option vector, float32, and the largest deviation of its actions from the plan
         """
         ends = np.array([len(plan)])
-        omega, residuals = self.trajectory.fit(plan, np.array([0]), ends, None if before is None else before[None])
+        starts = None if before is None else self.first_points(before[None], ends)
+        omega, residuals = self.trajectory.fit(plan, np.array([0]), ends, starts)
         return self.encode(omega, ends)[0], float(residuals[0])
 
     def plan(self, option: FloatArray, before: FloatArray | None = None) -> FloatArray:
         """All actions of an option, normalised.
 
         :param option: shape ``[action_dim · n_weights + 1]``, entries in [−1, 1]
-        :param before: with a continuous join the action that is being sent when it begins, normalised, shape ``[action_dim]``
+        :param before: what it leaves from unless the join is free, see :meth:`before`
         :return: shape ``[n_steps, action_dim]``
-        :raises ValueError: if ``before`` is missing with a continuous join, or given with a free one
+        :raises ValueError: if ``before`` is given with a free join, or missing with another
         """
         if (before is not None) != self.joined:
             raise ValueError(f"with join={self.join!r} a plan depends {'' if self.joined else 'not '}on the action before it")
         omega, n_steps = self.decode(option)
-        return self.trajectory.plan(omega, n_steps, before)
+        return self.trajectory.plan(omega, n_steps, None if before is None else self.first_points(before, n_steps))
 
 
 class ActionBox:

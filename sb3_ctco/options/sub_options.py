@@ -127,8 +127,8 @@ def sub_options(
     :param truncated: whether it was truncated with it
     :param reward_unit: ``"rate"`` or ``"impulse"``, see :func:`~sb3_ctco.options.integrated_reward`
     :param tolerance: largest deviation that a stretch's fitted actions may have, normalised
-    :param before: with a continuous join the normalised action that was being sent at each row of ``seen``,
-        ``[n_seen, action_dim]``, from which an option that begins there leaves
+    :param before: what an option leaves from that begins at each row of ``seen``, unless the join is free: ``[n_seen, *]`` of
+        :meth:`OptionSpace.before`
     """
     n_ran = len(rewards)
     firsts, ends = np.array(stretches, dtype=np.int64).reshape(-1, 2).T
@@ -137,7 +137,7 @@ def sub_options(
         long_enough = ends - firsts >= shortest_steps(space)
         firsts, ends = firsts[long_enough], ends[long_enough]
     rows = np.array(steps)
-    starts = None if before is None else before[rows.searchsorted(firsts)]
+    starts = None if before is None else space.first_points(before[rows.searchsorted(firsts)], ends - firsts)
     omega, residuals = space.trajectory.fit(plan, firsts, ends, starts)
     kept = residuals <= tolerance
     if not kept.all():
