@@ -136,7 +136,7 @@ def main() -> None:
         curves = []
         for seed in range(args.seeds):
             share = f"_{args.fraction:g}" if n else ""
-                path = args.folder / f"{args.task}_{n}{share}_{seconds:.0f}s_seed{seed}.csv"
+            path = args.folder / f"{args.task}_{n}{share}_{seconds:.0f}s_seed{seed}.csv"
             if not path.exists():
                 run(task, n, args.fraction, seed, seconds, path)
             with path.open(newline="") as file:

@@ -47,7 +47,7 @@ class _OptionStorage(ReplayBuffer):
 
     #: Of buffers that were saved without these
     reward_scale: float | Literal["auto"] = 1.0
-    demonstration_fraction = 0.5
+    demonstration_fraction = 0.25
     n_demonstrations = 0
     option_space: OptionSpace | None = None
     primitive_action_space: spaces.Box | None = None
