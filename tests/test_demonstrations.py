@@ -318,7 +318,6 @@ def test_minari_datasets_are_read():
 
 def test_a_minari_dataset_that_a_script_recorded(tmp_path):
     """With minari itself, by the example that makes a dataset from SAC."""
-    pytest.importorskip("minari")
     script = Path(__file__).parents[1] / "examples" / "record_demonstrations.py"
     arguments = ["--env", "Pendulum-v1", "--steps", "300", "--episodes", "2", "--dataset", "pendulum/sac-v0"]
     environment = {**os.environ, "MINARI_DATASETS_PATH": str(tmp_path), "PYTHONPATH": str(script.parents[1])}
@@ -339,7 +338,7 @@ def test_a_minari_dataset_that_a_script_recorded(tmp_path):
 @pytest.mark.parametrize("one_file_an_episode", [True, False])
 def test_lerobot_datasets_are_read(tmp_path, one_file_an_episode):
     """Versions 2 and 3 of the format: frames of two episodes of 6 and 4, the second of which is not done."""
-    pyarrow = pytest.importorskip("pyarrow")
+    import pyarrow
     from pyarrow import parquet
 
     (tmp_path / "meta").mkdir()
