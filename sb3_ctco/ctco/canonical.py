@@ -19,11 +19,16 @@ class CanonicalOptions:
     """
 
     def __init__(self, space: OptionSpace, device: th.device | str):
-        self._space = space
-        self._matrices = th.as_tensor(space.trajectory.canonical(space.n_before), dtype=th.float32, device=device)
+        self._n_weights = space.trajectory.n_weights
         n_steps = np.arange(1, steps_in(space.d_max, space.dt) + 1)
-        no_weights = np.empty((len(n_steps), 0, space.trajectory.n_weights))
-        self._durations = th.as_tensor(space.encode(no_weights, n_steps)[:, -1], device=device)
+        matrices = space.trajectory.canonical(space.n_before)
+        #: Of options of each number of steps: the matrix, and the last entry
+        self._matrices = th.as_tensor(matrices[n_steps.clip(max=len(matrices)) - 1], dtype=th.float32, device=device)
+        encode = lambda n: space.encode(np.empty((len(n), 0, self._n_weights)), n)[:, -1]  # noqa: E731
+        self._durations = th.as_tensor(encode(n_steps), device=device)
+        # From where on the last entry stands for one step more; where all options are of one duration, it always does.
+        bounds = encode(n_steps[1:] - 0.5) if space.d_max > space.d_min else np.full(len(n_steps) - 1, -1.0, np.float32)
+        self._bounds = th.as_tensor(bounds, device=device)
 
     @staticmethod
     def makes_no_difference(space: OptionSpace) -> bool:
@@ -36,10 +41,10 @@ class CanonicalOptions:
         :param options: normalised, ``[*batch, option_dim]``
         :return: likewise
         """
-        omega, d = options[..., :-1].unflatten(-1, (-1, self._space.trajectory.n_weights)), options[..., -1:]
-        n_steps = self._n_steps(options)
-        rounded = self._durations[n_steps - 1][..., None]
-        return th.cat(((omega @ self._of(n_steps).mT).flatten(-2), d + (rounded - d).detach()), dim=-1)
+        omega, d = options[..., :-1].unflatten(-1, (-1, self._n_weights)), options[..., -1:]
+        index = self._index(options)
+        rounded = self._durations[index][..., None]
+        return th.cat(((omega @ self._matrices[index].mT).flatten(-2), d + (rounded - d).detach()), dim=-1)
 
     def gradient(self, gradient: th.Tensor, options: th.Tensor) -> th.Tensor:
         """The gradient by options, from that by canonical ones.
@@ -47,13 +52,9 @@ class CanonicalOptions:
         :param gradient: ``[*batch, option_dim]``
         :param options: normalised, likewise
         """
-        by_omega = gradient[..., :-1].unflatten(-1, (-1, self._space.trajectory.n_weights))
-        return th.cat(((by_omega @ self._of(self._n_steps(options))).flatten(-2), gradient[..., -1:]), dim=-1)
+        by_omega = gradient[..., :-1].unflatten(-1, (-1, self._n_weights))
+        return th.cat(((by_omega @ self._matrices[self._index(options)]).flatten(-2), gradient[..., -1:]), dim=-1)
 
-    def _n_steps(self, options: th.Tensor) -> th.Tensor:
-        n_steps = (self._space.seconds(options[..., -1].detach()) / self._space.dt + 0.5).floor().long()
-        return n_steps.clamp(1, len(self._durations))
-
-    def _of(self, n_steps: th.Tensor) -> th.Tensor:
-        """The matrix of each option, ``[*batch, n_weights, n_weights]``."""
-        return self._matrices[n_steps.clamp(max=len(self._matrices)) - 1]
+    def _index(self, options: th.Tensor) -> th.Tensor:
+        """How many steps each option has, less one."""
+        return th.bucketize(options[..., -1].detach().contiguous(), self._bounds, right=True)
