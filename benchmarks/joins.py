@@ -98,7 +98,7 @@ def figure(args: argparse.Namespace) -> None:
         begins, signal = begins[begins < n_steps], actions[:n_steps, 0]
         panel.step(np.arange(len(signal)) * run.dt, signal, where="post", linewidth=1)
         panel.plot(begins * run.dt, signal[begins], "o", markersize=3, color="C1")
-        panel.set(title=run.setting, ylabel="action", ylim=(-1.05, 1.05))
+        panel.set(title=f"join={model.join!r}", ylabel="action", ylim=(-1.05, 1.05))
     panels[-1, 0].set_xlabel("time, s")
     plt.savefig(args.output, dpi=150)
 
