@@ -52,7 +52,7 @@ class Pushed(gym.Wrapper):
 
     def step(self, action: Any) -> Any:
         if self.np_random.random() < FREQUENCY * self.get_wrapper_attr("dt"):
-            physics = self.unwrapped._physics  # type: ignore[attr-defined]
+            physics = self.get_wrapper_attr("physics")
             physics.data.qvel[self.velocities] += self.scale * self.np_random.standard_normal(len(self.scale))
             physics.forward()
         return self.env.step(action)

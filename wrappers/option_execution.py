@@ -71,7 +71,7 @@ class OptionExecutionWrapper(gym.Wrapper, RecordConstructorArgs):
         (10, 0.5)
 
     :param env: the environment to wrap; its action space must be a ``Box`` with finite bounds, of any shape
-    :param n_rbf: number of radial basis functions an action dimension; 1 repeats one action
+    :param n_rbf: number of weights an action dimension; 1 repeats one action
     :param d_max: longest duration, in s; by default a fifth of the horizon 1/τ, 0.5 s at most, see
         :func:`~sb3_ctco.options.default_durations`
     :param d_min: shortest duration, in s; 0 for one step (``dt``), which an option takes in any case; by default a hundredth

@@ -61,7 +61,7 @@ class OptionOffPolicyAlgorithm(OffPolicyAlgorithm):
 
     Parameters that ``OffPolicyAlgorithm`` has are documented there; these differ or are further:
 
-    :param n_rbf: number of radial basis functions an action dimension
+    :param n_rbf: number of weights an action dimension
     :param d_max: longest duration of an option, in s
     :param d_min: shortest duration, in s, by default what ``OptionExecutionWrapper`` has; 0 for one step of the environment
     :param dt: the environment's interaction period, in s; by default found in the environment

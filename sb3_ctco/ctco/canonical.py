@@ -24,11 +24,10 @@ class CanonicalOptions:
         matrices = space.trajectory.canonical(space.n_before)
         #: Of options of each number of steps: the matrix, and the last entry
         self._matrices = th.as_tensor(matrices[n_steps.clip(max=len(matrices)) - 1], dtype=th.float32, device=device)
-        encode = lambda n: space.encode(np.empty((len(n), 0, self._n_weights)), n)[:, -1]  # noqa: E731
-        self._durations = th.as_tensor(encode(n_steps), device=device)
+        self._durations = th.as_tensor(space.normalised(n_steps * space.dt), dtype=th.float32, device=device)
         # From where on the last entry stands for one step more; where all options are of one duration, it always does.
-        bounds = encode(n_steps[1:] - 0.5) if space.d_max > space.d_min else np.full(len(n_steps) - 1, -1.0, np.float32)
-        self._bounds = th.as_tensor(bounds, device=device)
+        bounds = space.normalised((n_steps[1:] - 0.5) * space.dt) if space.d_max > space.d_min else -np.ones(len(n_steps) - 1)
+        self._bounds = th.as_tensor(bounds, dtype=th.float32, device=device)
 
     @staticmethod
     def makes_no_difference(space: OptionSpace) -> bool:

@@ -62,7 +62,7 @@ class CTCO(SoftOptionActorCritic):
     :param updates_per_second: updates per second of task time, in place of ``gradient_steps``
     :param n_sub_options: how many random stretches of each option that was played go into the replay buffer beside it,
         as options of their own, which counts in ``buffer_size``; 0 is the paper's way
-    :param n_rbf: number of radial basis functions an action dimension
+    :param n_rbf: number of weights an action dimension
     :param d_max: longest duration of an option, in s; by default a fifth of the horizon 1/τ, and 0.5 s at most
     :param d_min: shortest duration, in s; 0 for one step of the environment, which an option takes in any case; by default a
         hundredth of the horizon and 0.025 s at most, or a step if that is longer, see

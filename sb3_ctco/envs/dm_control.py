@@ -115,6 +115,11 @@ class DMControlEnv(gym.Env[np.ndarray, np.ndarray]):
         self._camera = {"width": width, "height": height, "camera_id": camera_id}
         self.metadata = {**self.metadata, "render_fps": 1.0 / self.dt}
 
+    @property
+    def physics(self) -> Any:
+        """dm_control's ``Physics``, for what changes the state from outside: call its ``forward()`` afterwards."""
+        return self._physics
+
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[np.ndarray, dict[str, Any]]:
         """Begin an episode; ``seed`` makes it and those that follow reproducible."""
         super().reset(seed=seed)

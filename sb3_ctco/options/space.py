@@ -167,6 +167,19 @@ class OptionSpace:
             return self.d_min * (self.d_max / self.d_min) ** fraction
         return self.d_min + fraction * (self.d_max - self.d_min)
 
+    def normalised(self, seconds: FloatArray) -> FloatArray:
+        """The numbers in [−1, 1] that :meth:`seconds` turns into these durations, or the nearest; 0 if d_min = d_max.
+
+        :param seconds: durations, in s
+        """
+        if self.d_max == self.d_min:
+            return np.zeros_like(seconds)
+        if self.duration_scale == "log":
+            fraction = np.log(seconds / self.d_min) / math.log(self.d_max / self.d_min)
+        else:
+            fraction = (seconds - self.d_min) / (self.d_max - self.d_min)
+        return (2.0 * fraction - 1.0).clip(-1.0, 1.0)
+
     def encode(self, omega: FloatArray, n_steps: npt.NDArray[np.integer]) -> FloatArray:
         """The option vectors that :meth:`decode` turns into these; d is encoded as 0 if d_min = d_max.
 
@@ -176,13 +189,7 @@ class OptionSpace:
         """
         options = np.zeros((len(omega), omega.shape[1] * omega.shape[2] + 1), dtype=np.float32)
         options[:, :-1] = omega.reshape(len(omega), options.shape[1] - 1)
-        if self.d_max > self.d_min:
-            durations = n_steps * self.dt
-            if self.duration_scale == "log":
-                fraction = np.log(durations / self.d_min) / math.log(self.d_max / self.d_min)
-            else:
-                fraction = (durations - self.d_min) / (self.d_max - self.d_min)
-            options[:, -1] = (2.0 * fraction - 1.0).clip(-1.0, 1.0)
+        options[:, -1] = self.normalised(n_steps * self.dt)
         return options
 
     def decode(self, option: FloatArray) -> tuple[FloatArray, int]:
