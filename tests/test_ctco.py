@@ -32,6 +32,12 @@ def make(env, **kwargs):
     return CTCO("MlpPolicy", env, **{**SMALL, **kwargs})
 
 
+def set_temperature_of_d(model, temperature):
+    """Another one than that of ω, so that numbers worked by hand tell which is where."""
+    with th.no_grad():
+        model.log_ent_coefs[-1] = math.log(temperature)
+
+
 # --- losses, from numbers worked by hand
 
 
@@ -114,7 +120,8 @@ def test_entropy_references():
 
 
 def test_relative_to_the_average_a_decision_costs_nothing():
-    model = make(random_walk_like(), n_rbf=1, ent_coef=1.0, duration_ent_coef=0.5, entropy_reference="average")
+    model = make(random_walk_like(), n_rbf=1, ent_coef=1.0, entropy_reference="average")
+    set_temperature_of_d(model, 0.5)
     # 5 and 7 are 1 off their mean, 1 and 3 likewise at half the temperature.
     costs = model.entropy_costs(th.tensor([[5.0, 1.0], [7.0, 3.0]]))
     th.testing.assert_close(costs, th.tensor([[-1.5], [1.5]]))
@@ -122,14 +129,15 @@ def test_relative_to_the_average_a_decision_costs_nothing():
 
 def test_each_weight_of_a_trajectory_has_a_temperature():
     """Two actions of three weights: the first, the second and the third of both share one; d has its own."""
-    model = make(random_walk_like(action_dim=2), n_rbf=3, ent_coef="auto_0.5", duration_ent_coef=0.25)
+    model = make(random_walk_like(action_dim=2), n_rbf=3, ent_coef="auto_0.5")
+    set_temperature_of_d(model, 0.25)
     th.testing.assert_close(model.ent_coefs, th.tensor([0.5, 0.5, 0.5, 0.25]))
     th.testing.assert_close(model._target_entropies, th.tensor([-2.0, -2.0, -2.0, -1.0]))
     log_prob = th.tensor([[1.0, 2.0, 4.0, 10.0, 20.0, 40.0, 7.0]])
     th.testing.assert_close(log_prob @ model._parts, th.tensor([[11.0, 22.0, 44.0, 7.0]]))
-    # Each follows its own weights: more random than −2, as random, and less.
+    # Each follows its own weights: more random than −2, as random, and less; and d is less random than −1.
     model._update_temperatures(th.tensor([[1.0, 2.0, 3.0, 9.0]]))
-    assert th.sign(model.ent_coefs - th.tensor([0.5, 0.5, 0.5, 0.25])).tolist() == [-1.0, 0.0, 1.0, 0.0]
+    assert th.sign(model.ent_coefs - th.tensor([0.5, 0.5, 0.5, 0.25])).tolist() == [-1.0, 0.0, 1.0, 1.0]
 
 
 @pytest.mark.slow
@@ -143,7 +151,7 @@ def test_the_price_of_a_decision_is_the_penalty_alone(scripted_env):
         env = scripted_env(rewards=lambda step, action: 0.0, dt=0.1, truncate_at=50)
         small = {"n_rbf": 1, "d_max": 2.0, "batch_size": 64, "policy_kwargs": {"net_arch": [32, 32]}, "learning_rate": 1e-3}
         timing = {"gamma": 0.9, "gamma_dt": 0.1, "updates_per_second": 5, "learning_starts": 500}
-        temperatures = {"ent_coef": 0.1, "duration_ent_coef": 0.1, "duration_scale": "linear"}
+        temperatures = {"ent_coef": 0.1, "duration_scale": "linear"}
         model = make(env, **{**small, **timing, **temperatures, "seed": seed, **kwargs}).learn(6000)
         obs = th.tensor([[count, 0.0] for count in range(0, 50, 5)]).repeat(200, 1)
         with th.no_grad():
@@ -159,11 +167,11 @@ def test_the_price_of_a_decision_is_the_penalty_alone(scripted_env):
 
 def test_a_decision_is_never_paid_for_its_entropy():
     """Relative to the uniform distribution the expected cost is a KL divergence, at least 0."""
-    model = make(random_walk_like(), ent_coef=1.0, duration_ent_coef=1.0)
+    model = make(random_walk_like(), ent_coef=1.0)
     _, log_prob = model.actor.option_log_prob(th.zeros(4096, 2))
     assert model.entropy_costs(log_prob @ model._parts).mean() > -0.05
     # With the paper's density the same policy is paid at each decision.
-    model = make(random_walk_like(), ent_coef=1.0, duration_ent_coef=1.0, entropy_reference="paper", duration_scale="linear")
+    model = make(random_walk_like(), ent_coef=1.0, entropy_reference="paper", duration_scale="linear")
     assert model.entropy_costs(log_prob @ model._parts).mean() < -0.5
 
 
@@ -175,7 +183,7 @@ def test_paper_entropies_need_the_papers_durations():
 def test_the_critics_see_what_is_played(random_walk_env):
     """Of one step the first of two weights is all: options that differ in the other have one value, and no gradient by it."""
     of_options = {"n_rbf": 2, "d_max": 0.5, "duration_scale": "linear"}
-    model = make(random_walk_env(), **of_options, trajectory="bezier", canonical_options=True).learn(40)
+    model = make(random_walk_env(), **of_options, trajectory="bezier").learn(40)
     obs = th.zeros(2, 2)
     # Of one step: up to 0.15 s, which is −0.75 on the way from 0.1 to 0.5 s
     options = th.tensor([[0.3, 0.9, -1.0], [0.3, -0.4, -0.8]], requires_grad=True)
@@ -186,8 +194,8 @@ def test_the_critics_see_what_is_played(random_walk_env):
     # Three steps are −1 + 2·0.2/0.4.
     longer = th.tensor([[0.3, 0.9, 0.1]])
     th.testing.assert_close(model._as_critics_see(longer), th.tensor([[0.3, 0.9, 0.0]]))
-    # Where the shortest option has two steps, weights stay as they are, and so does all.
-    for kwargs in ({"d_min": 0.2, "canonical_options": True}, {"canonical_options": False}):
+    # Where the shortest option has two steps, weights stay as they are, and so does all; and with the paper's basis functions.
+    for kwargs in ({"d_min": 0.2}, {"trajectory": "rbf"}):
         assert make(random_walk_env(), **{**of_options, **kwargs})._as_critics_see(longer) is longer
 
 
@@ -224,7 +232,7 @@ def test_what_a_decision_costs_is_logged(random_walk_env):
 @pytest.mark.parametrize("scale", [0.0, -1.0, math.inf, "gamma_dt"])
 def test_a_reward_scale_that_is_none(scale, random_walk_env):
     with pytest.raises(ValueError, match="reward_scale must be a positive number or 'auto'"):
-        make(random_walk_env(), reward_scale=scale)
+        make(random_walk_env(), replay_buffer_kwargs={"reward_scale": scale})
 
 
 @pytest.mark.parametrize("fast", [True, False])
@@ -233,7 +241,8 @@ def test_units_make_no_difference(fast):
 
     def learned(factor=1.0, gamma=0.98, gamma_dt=0.05):
         env = gym.wrappers.TransformReward(gym.make("Pendulum-v1"), lambda r: factor * r)
-        settings = {"gamma": gamma, "gamma_dt": gamma_dt, "reward_scale": "auto", "d_max": 0.3, "fast_updates": fast}
+        unit = {"replay_buffer_kwargs": {"reward_scale": "auto"}}
+        settings = {"gamma": gamma, "gamma_dt": gamma_dt, "d_max": 0.3, "fast_updates": fast, **unit}
         model = make(env, n_sub_options=2, learning_starts=50, policy_kwargs={"net_arch": [16]}, **settings).learn(200)
         assert model._n_updates > 50
         return th.nn.utils.parameters_to_vector(model.policy.parameters())
@@ -246,14 +255,15 @@ def test_units_make_no_difference(fast):
 
 
 def test_the_scale_that_was_found_stays(tmp_path, random_walk_env):
-    model = make(random_walk_env(), reward_scale="auto", learning_starts=10)
+    model = make(random_walk_env(), replay_buffer_kwargs={"reward_scale": "auto"}, learning_starts=10)
     assert model.replay_buffer.reward_scale == "auto"
     model.learn(30).save(tmp_path / "model")
     found = model.replay_buffer.reward_scale
     assert found > 0
     resumed = CTCO.load(tmp_path / "model", env=random_walk_env())
-    assert resumed.reward_scale == "auto"
     assert resumed.replay_buffer.reward_scale == found
+    for given in ({}, {"reward_scale": 2.0}, None):
+        assert CTCO.load(tmp_path / "model", replay_buffer_kwargs=given).replay_buffer.reward_scale == found
     model.save_replay_buffer(tmp_path / "buffer")
     resumed.load_replay_buffer(tmp_path / "buffer")
     assert resumed.learn(30, reset_num_timesteps=False).replay_buffer.reward_scale == found
@@ -261,7 +271,7 @@ def test_the_scale_that_was_found_stays(tmp_path, random_walk_env):
 
 def test_a_loaded_buffer_has_the_algorithms_unit_and_discount(tmp_path, random_walk_env):
     make(random_walk_env()).learn(30).save_replay_buffer(tmp_path / "buffer")
-    model = make(random_walk_env(), reward_scale=7.0)
+    model = make(random_walk_env(), replay_buffer_kwargs={"reward_scale": 7.0})
     model.load_replay_buffer(tmp_path / "buffer")
     assert model.replay_buffer.reward_scale == 7.0
     with pytest.raises(ValueError, match=r"discount_rate=0.40.*discount_rate=0.20.*the same gamma and gamma_dt"):
@@ -275,7 +285,7 @@ def test_with_one_step_options_targets_and_losses_are_sacs():
     options = {"n_rbf": 1, "d_min": 0.05, "d_max": 0.05, "n_sub_options": 0, "high_freq_penalty": 0.0}
     tau = discount_rate_from_gamma(0.97, 0.05)
     unit = {
-        "reward_scale": 1 / step_weight(0.05, tau),
+        "replay_buffer_kwargs": {"reward_scale": 1 / step_weight(0.05, tau)},
         "gamma_dt": 0.05,
         "entropy_reference": "paper",
         "duration_scale": "linear",
@@ -367,8 +377,7 @@ def test_the_penalty_is_found_that_keeps_a_decision_rate(decision_rate):
         learning_rate=3e-3,
         tau=0.02,
         batch_size=64,
-        ent_coef=0.0,
-        duration_ent_coef=0.001,
+        ent_coef=0.001,
         updates_per_second=10,
         policy_kwargs={"net_arch": [32]},
     )
@@ -397,9 +406,9 @@ def test_a_decision_rate_is_kept_from_above_only():
 
 
 def test_target_entropies_may_be_schedules(random_walk_env):
-    # 3 at the beginning, −3 in the end
-    model = make(random_walk_env(), target_entropy=lambda remaining: 6 * remaining - 3, duration_target_entropy=-0.5)
-    assert model._target_entropies.tolist() == [1.0, 1.0, 1.0, -0.5]  # of three weights
+    # 4 at the beginning, −4 in the end, of three weights and d
+    model = make(random_walk_env(), target_entropy=lambda remaining: 8 * remaining - 4)
+    assert model._target_entropies.tolist() == [1.0, 1.0, 1.0, 1.0]
     model.learn(200)
     model._current_progress_remaining = 0.25
     model.train(1, 8)
@@ -457,10 +466,10 @@ def test_one_update_by_hand(random_walk_env):
         learning_starts=1000,
         learning_rate=0.0,
         ent_coef=0.2,
-        duration_ent_coef=0.4,
         high_freq_penalty=0.05,
-        canonical_options=False,
+        trajectory="rbf",
     )
+    set_temperature_of_d(model, 0.4)
     model.learn(200)
     # Let the targets differ from what they follow.
     with th.no_grad():
@@ -505,8 +514,8 @@ def test_the_penalty_is_a_number_or_a_schedule_and_needs_no_new_data(random_walk
     assert len(batch.rewards) == 16
 
 
-def test_polyak_and_the_step_size_of_d(random_walk_env):
-    model = make(random_walk_env(), learning_starts=1000, tau=0.25, learning_rate=1e-2, duration_learning_rate=1e-5)
+def test_polyak_and_the_step_size(random_walk_env):
+    model = make(random_walk_env(), learning_starts=1000, tau=0.25, learning_rate=1e-2)
     model.learn(100)
     before = {name: p.clone() for name, p in model.policy.named_parameters()}
     model.train(1, 16)
@@ -522,32 +531,28 @@ def test_polyak_and_the_step_size_of_d(random_walk_env):
     # Adam's first step is its step size, a parameter.
     moved = lambda name: (after[name] - before[name]).abs().max().item()  # noqa: E731
     assert moved("actor.omega_head.bias") == pytest.approx(1e-2, rel=0.01)
-    assert moved("actor.duration_head.bias") == pytest.approx(1e-5, rel=0.05)
+    assert moved("actor.duration_head.bias") == pytest.approx(1e-2, rel=0.01)
 
 
 def test_temperatures(random_walk_env):
-    model = make(random_walk_env(), learning_starts=1000, ent_coef="auto_0.5", duration_ent_coef=0.3, learning_rate=0.1)
-    assert model.target_entropy == -3.0  # ω has three entries
-    assert model.duration_target_entropy == -1.0
+    model = make(random_walk_env(), learning_starts=1000, ent_coef="auto_0.5", learning_rate=0.1)
+    assert model.target_entropy == -4.0  # ω has three entries, and d is one more
+    assert model._target_entropies.tolist() == [-1.0, -1.0, -1.0, -1.0]
     model.learn(60)
-    before = model.log_ent_coefs.detach().exp().tolist()
-    assert before == pytest.approx([0.5, 0.5, 0.5, 0.3])
+    assert model.log_ent_coefs.detach().exp().tolist() == pytest.approx([0.5, 0.5, 0.5, 0.5])
     model.train(1, 8)
-    # A new policy is far more random than its target: its temperature falls by Adam's first step; a number stays.
-    after = model.log_ent_coefs.detach().tolist()
-    assert after[0] == pytest.approx(math.log(0.5) - 0.1, abs=1e-4)
-    assert after[-1] == pytest.approx(math.log(0.3), abs=1e-6)
-    for ent_coef in (0, 0.0):
-        model = make(random_walk_env(), ent_coef=ent_coef, duration_ent_coef="auto").learn(60)
-        assert model.log_ent_coefs.detach().exp()[0] == 0.0
+    # A new policy is far more random than its target: its temperatures fall by Adam's first step.
+    assert model.log_ent_coefs.detach().tolist() == pytest.approx([math.log(0.5) - 0.1] * 4, abs=1e-4)
+    for ent_coef in (0, 0.0, 0.3):
+        model = make(random_walk_env(), ent_coef=ent_coef).learn(60)
+        assert model.ent_coefs.tolist() == pytest.approx([ent_coef] * 4)  # A number stays.
         assert all(th.isfinite(p).all() for p in model.policy.parameters())
 
 
-@pytest.mark.parametrize("name", ["ent_coef", "duration_ent_coef"])
 @pytest.mark.parametrize("value", ["automatic", "auto_0", "auto_x", -0.1, math.nan])
-def test_bad_temperatures(random_walk_env, name, value):
-    with pytest.raises(ValueError, match=name):
-        make(random_walk_env(), **{name: value})
+def test_bad_temperatures(random_walk_env, value):
+    with pytest.raises(ValueError, match="ent_coef must be a number of at least 0, 'auto', or"):
+        make(random_walk_env(), ent_coef=value)
 
 
 # --- the special case: with one basis function and d = dt, it is SAC
@@ -775,7 +780,7 @@ def test_a_bad_environment_leaves_no_trace_in_the_buffer(scripted_env, bad):
 
 
 def test_save_and_load(tmp_path, random_walk_env):
-    model = make(random_walk_env(), n_rbf=2, d_max=0.7, d_min=0.2, ent_coef=0.1, duration_learning_rate=1e-4).learn(60)
+    model = make(random_walk_env(), n_rbf=2, d_max=0.7, d_min=0.2, ent_coef=0.1).learn(60)
     model.save(tmp_path / "model")
     obs = np.random.default_rng(0).uniform(-1, 1, (20, 2)).astype(np.float32)
     expected, _ = model.predict(obs, deterministic=True)

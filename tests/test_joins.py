@@ -538,7 +538,6 @@ def test_pendulum_is_learned(join):
         d_max=0.3,
         high_freq_penalty=0.01,
         ent_coef="auto_0.1",
-        duration_ent_coef="auto_0.1",
         policy_kwargs={"net_arch": [64, 64]},
         seed=0,
         device="cpu",

@@ -34,7 +34,6 @@ def test_deviations_are_those_of_the_code():
     for name, value, phrase in [
         ("gradient_steps", -1, "one for each primitive step (`gradient_steps=-1`)"),
         ("ent_coef", "auto_0.02", "learned by dual ascent from 0.02"),
-        ("duration_ent_coef", "auto_0.02", "learned by dual ascent from 0.02"),
         ("learning_starts", 100, "`learning_starts=100` steps play random options"),
         ("learning_rate", 3e-4, "Adam, 3e-4"),
         ("d_max", None, "| a fifth of the horizon 1/τ, 0.5 s | `d_max` |"),
@@ -52,11 +51,9 @@ def test_deviations_are_those_of_the_code():
         "entropy_reference",
         "policy_kwargs",
         # What the class has, too, and must stay if its defaults change
-        "reward_scale",
         "trajectory",
         "duration_scale",
         "join",
-        "canonical_options",
         "d_min",
     }
     assert defaults["high_freq_penalty"] == 0.003

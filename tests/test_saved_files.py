@@ -33,7 +33,8 @@ def test_a_model_of_0_1_0_acts_as_it_did_and_learns_on(algorithm):
     assert model.option_space.duration_scale == "linear"
     assert model.replay_buffer.reward_scale == 1.0
     if algorithm is CTCO:
-        assert not model.canonical_options  # Its critics saw weights as they were.
+        assert model._canonical is None  # Its critics saw weights as they were,
+        assert model.target_entropy == -model.actor.omega_dim - 1.0  # and the target entropy was that of ω.
         assert model.option_space.trajectory == RadialBasis(model.n_rbf)
         assert len(model.ent_coefs) == model.n_rbf + 1
     before = model._n_updates

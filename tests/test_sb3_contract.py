@@ -96,7 +96,7 @@ class StopsAt(BaseCallback):
     [
         {},
         {"ent_coef": 0.1},
-        {"ent_coef": "auto_0.01", "duration_ent_coef": 0.0},
+        {"ent_coef": "auto_0.01"},
         {"policy_kwargs": {"n_critics": 1}},
         {"policy_kwargs": {"n_critics": 3, "activation_fn": nn.Tanh, "net_arch": {"pi": [4, 4], "qf": [8]}}},
         {"policy_kwargs": {"share_features_extractor": True}},

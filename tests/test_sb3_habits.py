@@ -426,7 +426,11 @@ _CHANGES: dict[str, tuple[Any, Any]] = {
     "train_freq": (7, lambda model: model.train_freq.frequency == 7),
     "gradient_steps": (3, lambda model: (model.gradient_steps, model.updates_per_second) == (3, None)),
     "updates_per_second": (5.0, lambda model: (getattr(model, "gradient_steps", -1), model.updates_per_second) == (-1, 5.0)),
-    "target_entropy": (-7.0, lambda model: math.isclose(model._target_entropies[:-1].sum(), -7.0, rel_tol=1e-6)),
+    # Of an option in CTCO, of the action in FiGAR-SAC
+    "target_entropy": (
+        -7.0,
+        lambda model: math.isclose(model._target_entropies[: 99 if type(model) is CTCO else -1].sum(), -7.0, rel_tol=1e-6),
+    ),
     "duration_target_entropy": (-2.0, lambda model: model._target_entropies[-1] == -2.0),
     "stats_window_size": (5, lambda model: model._stats_window_size == 5),
     "n_sub_options": (3, lambda model: model.get_env().get_attr("n_sub_options") == [3]),
@@ -440,7 +444,6 @@ _REFUSED = {
     "d_max": 0.6,
     "d_min": 0.2,
     "dt": 0.05,  # of DAC-PPO alone: a policy of options may run at another rate
-    "reward_scale": 2.0,
     "n_rbf": 2,
     "n_repetitions": 7,
     "ent_coef": 0.7,

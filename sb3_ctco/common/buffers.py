@@ -69,6 +69,8 @@ class _OptionStorage(ReplayBuffer):
     ):
         if not 0.0 <= demonstration_fraction <= 1.0:
             raise ValueError(f"demonstration_fraction must be a part of each batch, in [0, 1], not {demonstration_fraction}")
+        if reward_scale != "auto" and not (isinstance(reward_scale, int | float) and 0 < reward_scale < math.inf):
+            raise ValueError(f"reward_scale must be a positive number or 'auto', not {reward_scale!r}")
         if optimize_memory_usage:
             raise ValueError(
                 f"{type(self).__name__} does not support optimize_memory_usage=True: it would lose the observation "
@@ -455,7 +457,7 @@ class OptionReplayBuffer(_OptionStorage):
     :param demonstration_fraction: part of each batch that is drawn from what ``add_trajectory`` stored, if that is anything
     :param option_space: what options mean, for ``add_trajectory``; CTCO and FiGAR-SAC tell their buffer
     :param primitive_action_space: the action space of the bare environment, likewise
-    :raises ValueError: if ``optimize_memory_usage`` is asked for
+    :raises ValueError: for a number out of range, or if ``optimize_memory_usage`` is asked for
     """
 
     def _get_samples(self, batch_inds: np.ndarray, env: VecNormalize | None = None) -> ReplayBufferSamples:

@@ -6,7 +6,7 @@ import math
 import pathlib
 import warnings
 import zipfile
-from typing import Any, ClassVar, Literal, TypeVar
+from typing import Any, ClassVar, TypeVar
 
 import gymnasium as gym
 import numpy as np
@@ -68,8 +68,6 @@ class OptionOffPolicyAlgorithm(OffPolicyAlgorithm):
     :param trajectory: how ω becomes actions, a name in ``sb3_ctco.options.TRAJECTORIES`` or a class
     :param duration_scale: ``"log"`` or ``"linear"``, see :class:`~sb3_ctco.options.OptionSpace`
     :param join: ``"free"``, ``"continuous"`` or ``"smooth"``, see :class:`~sb3_ctco.wrappers.OptionExecutionWrapper`
-    :param reward_scale: what R is multiplied by for the critics, or ``"auto"``, see
-        :class:`~sb3_ctco.common.buffers.OptionReplayBuffer`
     :param gamma: discount factor over ``gamma_dt`` seconds, in (0, 1]
     :param gamma_dt: in s
     :param train_freq: collect at least this many primitive steps (in each environment) between trainings
@@ -89,8 +87,6 @@ class OptionOffPolicyAlgorithm(OffPolicyAlgorithm):
         "trajectory",
         "duration_scale",
         "join",
-        "reward_scale",
-        "canonical_options",
         "n_repetitions",
         "ent_coef",
         "duration_ent_coef",
@@ -104,7 +100,6 @@ class OptionOffPolicyAlgorithm(OffPolicyAlgorithm):
         "trajectory": "rbf",
         "duration_scale": "linear",
         "join": "free",
-        "reward_scale": 1.0,
     }
 
     def __init__(
@@ -120,7 +115,6 @@ class OptionOffPolicyAlgorithm(OffPolicyAlgorithm):
         trajectory: str | type[Trajectory] = "bezier",
         duration_scale: DurationScale = "log",
         join: Join = "free",
-        reward_scale: float | Literal["auto"] = 1.0,
         gamma: float,
         gamma_dt: float,
         updates_per_second: float | None,
@@ -136,15 +130,12 @@ class OptionOffPolicyAlgorithm(OffPolicyAlgorithm):
         self.trajectory = trajectory
         self.duration_scale: DurationScale = duration_scale
         self.join: Join = join
-        self.reward_scale: float | Literal["auto"] = reward_scale
         self.gamma = gamma
         self.gamma_dt = gamma_dt
         # An explicit dt stays the user's word on any environment; one that was found must be found again.
         self._dt_was_given = dt is not None
         #: τ, in 1/s
         self.discount_rate = discount_rate_from_gamma(gamma, gamma_dt)
-        if reward_scale != "auto" and not (isinstance(reward_scale, int | float) and 0 < reward_scale < math.inf):
-            raise ValueError(f"reward_scale must be a positive number or 'auto', not {reward_scale!r}")
         if updates_per_second is not None:
             if gradient_steps != -1:
                 raise ValueError(
@@ -332,7 +323,12 @@ class OptionOffPolicyAlgorithm(OffPolicyAlgorithm):
         """
         saved = cls._saved_attributes(path)
         kwargs = check_load_arguments(cls, path, kwargs, cls._kept_when_loaded)
-        kwargs.update({name: value for name, value in cls._before_it_was_saved.items() if saved and name not in saved})
+        if saved:
+            kwargs = {**cls._arguments_of_older_files(saved), **kwargs}
+        if "replay_buffer_kwargs" in kwargs:
+            # Critics learned with the file's unit of values.
+            unit = saved.get("replay_buffer_kwargs", {}).get("reward_scale", 1.0)
+            kwargs["replay_buffer_kwargs"] = {**(kwargs["replay_buffer_kwargs"] or {}), "reward_scale": unit}
         # Of two that say the same in different ways, the one that is given holds.
         if "gradient_steps" in kwargs:
             kwargs.setdefault("updates_per_second", None)
@@ -348,6 +344,14 @@ class OptionOffPolicyAlgorithm(OffPolicyAlgorithm):
             if model.seed is not None:
                 model.env.seed(model.seed)  # type: ignore[union-attr]
         return model
+
+    @classmethod
+    def _arguments_of_older_files(cls, saved: dict[str, Any]) -> dict[str, Any]:
+        """Arguments that a file says nothing of because its version did not have them.
+
+        :param saved: what the file says of the model's attributes
+        """
+        return {name: value for name, value in cls._before_it_was_saved.items() if name not in saved}
 
     def _after_load(self) -> None:
         """What is left to do when a file has been read; nothing here."""
@@ -386,11 +390,7 @@ class OptionOffPolicyAlgorithm(OffPolicyAlgorithm):
             )
         # Once more, since load may have changed gamma.
         self.discount_rate = discount_rate_from_gamma(self.gamma, self.gamma_dt)
-        kwargs = {**self.replay_buffer_kwargs, "discount_rate": self.discount_rate}
-        if self.reward_scale != "auto":
-            kwargs["reward_scale"] = self.reward_scale
-        # What "auto" found stays, since critics learned with it.
-        self.replay_buffer_kwargs = {"reward_scale": "auto", **kwargs}
+        self.replay_buffer_kwargs = {"reward_scale": 1.0, **self.replay_buffer_kwargs, "discount_rate": self.discount_rate}
         if self.env is not None:
             settings = self._check_env(self.env)
             self.dt, self.d_min = settings.dt, settings.d_min

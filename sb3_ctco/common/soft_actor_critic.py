@@ -20,14 +20,13 @@ class SoftOptionActorCritic(OptionOffPolicyAlgorithm):
 
     Each part has temperatures of its own, the duration one, and what to do as many as ``_n_temperatures`` says. Subclasses
     say how the policy is sampled, what the critics learn, and how the actor is judged: ``_sample_policy``, ``_q_values``,
-    ``_critic_targets``, ``_critic_loss``, ``_actor_loss`` and ``_auto_target_entropies``.
+    ``_critic_targets``, ``_critic_loss``, ``_actor_loss``, ``_auto_target_entropy`` and ``_split_target_entropy``.
 
     Parameters that :class:`~sb3_ctco.common.option_algorithm.OptionOffPolicyAlgorithm` has are documented there:
 
     :param ent_coef: temperature of what to do: a number, ``"auto"`` to learn it, or ``"auto_0.1"`` to start at 0.1
     :param duration_ent_coef: temperature of the duration, likewise
-    :param target_entropy: entropy that a learned temperature keeps, or ``"auto"``
-    :param duration_target_entropy: likewise for the duration
+    :param target_entropy: entropy that learned temperatures keep, a function of the remaining progress, or ``"auto"``
     """
 
     policy: SoftOptionPolicy
@@ -44,14 +43,12 @@ class SoftOptionActorCritic(OptionOffPolicyAlgorithm):
         ent_coef: str | float,
         duration_ent_coef: str | float,
         target_entropy: str | float | Schedule,
-        duration_target_entropy: str | float | Schedule,
         **kwargs: Any,
     ):
         super().__init__(policy, env, learning_rate, **kwargs)
         self.ent_coef = ent_coef
         self.duration_ent_coef = duration_ent_coef
         self.target_entropy = target_entropy
-        self.duration_target_entropy = duration_target_entropy
 
     def _setup_model(self) -> None:
         super()._setup_model()
@@ -77,19 +74,21 @@ class SoftOptionActorCritic(OptionOffPolicyAlgorithm):
         self.critic = self.policy.critic  # type: ignore[assignment]
         self.critic_target = self.policy.critic_target  # type: ignore[assignment]
 
-    def _auto_target_entropies(self) -> tuple[float, float]:
-        """What ``"auto"`` stands for: the target entropies of what to do, and of the duration."""
+    def _auto_target_entropy(self) -> float:
+        """The target entropy that ``"auto"`` stands for."""
+        raise NotImplementedError
+
+    def _split_target_entropy(self, target: float) -> tuple[float, float]:
+        """The target entropies of what to do, and of the duration.
+
+        :param target: ``target_entropy`` at the remaining progress
+        """
         raise NotImplementedError
 
     def _setup_temperatures(self) -> None:
         """All temperatures and what belongs to them as vectors ``[n + 1]``: those of what to do, and the duration's."""
-        auto_target, auto_duration_target = self._auto_target_entropies()
         if isinstance(self.target_entropy, str):
-            self.target_entropy = _parse_target_entropy("target_entropy", self.target_entropy, auto_target)
-        if isinstance(self.duration_target_entropy, str):
-            self.duration_target_entropy = _parse_target_entropy(
-                "duration_target_entropy", self.duration_target_entropy, auto_duration_target
-            )
+            self.target_entropy = parse_target_entropy("target_entropy", self.target_entropy, self._auto_target_entropy())
         coef, learned = _parse_ent_coef("ent_coef", self.ent_coef)
         duration_coef, duration_learned = _parse_ent_coef("duration_ent_coef", self.duration_ent_coef)
         if self.d_min == self.d_max:
@@ -115,15 +114,10 @@ class SoftOptionActorCritic(OptionOffPolicyAlgorithm):
         """How many temperatures what to do has."""
         return 1
 
-    def _current_target_entropies(self) -> tuple[float, float]:
-        """The target entropies of what to do and of the duration, at the remaining progress."""
-        # "auto" was resolved when the temperatures were set up.
-        assert not isinstance(self.target_entropy, str) and not isinstance(self.duration_target_entropy, str)
-        remaining = self._current_progress_remaining
-        return FloatSchedule(self.target_entropy)(remaining), FloatSchedule(self.duration_target_entropy)(remaining)
-
     def _update_target_entropies(self) -> None:
-        target, duration_target = self._current_target_entropies()
+        assert not isinstance(self.target_entropy, str)  # since the temperatures were set up
+        current = FloatSchedule(self.target_entropy)(self._current_progress_remaining)
+        target, duration_target = self._split_target_entropy(current)
         self._target_entropies[:-1] = target / self._n_temperatures()
         self._target_entropies[-1] = duration_target
 
@@ -170,7 +164,7 @@ class SoftOptionActorCritic(OptionOffPolicyAlgorithm):
                 losses.append(update(self.replay_buffer.sample(batch_size, env=self._vec_normalize_env)))
 
         self._n_updates += gradient_steps
-        # What "auto" found is saved with the model, which its replay buffer is not.
+        # What reward_scale="auto" found is saved with the model, which its replay buffer is not.
         self.replay_buffer_kwargs["reward_scale"] = self.replay_buffer.reward_scale  # type: ignore[attr-defined]
         # Read once, because each reading waits for the device.
         pi_loss_mean, q_loss_mean, ent_coef_loss_mean = th.stack(losses).mean(dim=0).tolist()
@@ -270,7 +264,7 @@ class SoftOptionActorCritic(OptionOffPolicyAlgorithm):
         return state_dicts, ["log_ent_coefs"]
 
 
-def _parse_target_entropy(name: str, value: str, auto: float) -> float:
+def parse_target_entropy(name: str, value: str, auto: float) -> float:
     """A target entropy that was given as a string.
 
     :raises ValueError: if it is neither "auto" nor a number

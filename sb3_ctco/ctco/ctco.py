@@ -3,7 +3,7 @@
 import contextlib
 import math
 from collections.abc import Callable, Iterator
-from typing import Any, ClassVar, Literal
+from typing import Any, ClassVar
 
 import torch as th
 from stable_baselines3.common.buffers import ReplayBuffer
@@ -38,9 +38,8 @@ class CTCO(SoftOptionActorCritic):
 
     Where it differs from the paper, the paper's way is an argument away: entropy counts relative to the uniform
     distribution (``entropy_reference="paper"``), two critics (``policy_kwargs=dict(n_critics=1)``), temperatures
-    for ω and d, learned (pass numbers; the same one twice is the paper's β_E), ω squashed by tanh so that actions stay
-    in their bounds, and a shortest duration that follows from the discount (``d_min=0`` is one step, as the paper's durations
-    are in (0, d_max)).
+    for ω and d, learned (pass a number for the paper's β_E), ω squashed by tanh so that actions stay in their bounds, and
+    a shortest duration that follows from the discount (``d_min=0`` is one step, as the paper's durations are in (0, d_max)).
 
     Settings that the paper's algorithm would have are in :meth:`paper_defaults`; the class's own were measured to learn
     faster on the paper's tasks.
@@ -69,33 +68,27 @@ class CTCO(SoftOptionActorCritic):
         :func:`~sb3_ctco.options.default_durations`
     :param dt: interaction period of the environment, in s; by default found in the environment
     :param trajectory: how ω becomes actions: ``"bezier"``, ``"rbf"``, the paper's radial basis functions, or a subclass of
-        :class:`~sb3_ctco.options.Trajectory`
+        :class:`~sb3_ctco.options.Trajectory`. It also says whether critics see the same vector for all options that play the
+        same actions, see :class:`~sb3_ctco.ctco.canonical.CanonicalOptions`, or ω and d as they are, as in the paper
     :param duration_scale: ``"log"`` or ``"linear"``, the paper's, see :class:`~sb3_ctco.options.OptionSpace`
     :param join: where an option's actions begin: wherever its weights say (``"free"``, the paper's way), at the action that
         is being sent then (``"continuous"``), or there and at the slope at which actions were changing (``"smooth"``), see
         :class:`~sb3_ctco.wrappers.OptionExecutionWrapper`
-    :param reward_scale: what R is multiplied by for the critics, a number, or ``"auto"`` for a unit that does not depend on
-        that of rewards, in which the best option before learning, if it were repeated forever, is worth 100. β_h and
-        temperatures are in the unit of what results
     :param high_freq_penalty: β_h, subtracted once a decision in the critic's target, or a function of the remaining
-        progress
+        progress; in the unit of R, times the buffer's ``reward_scale``
     :param target_decision_rate: in Hz, in place of a fixed β_h: ``high_freq_penalty`` is where β_h starts, and it rises
         while the policy decides more often than this, and falls while it decides less often
-    :param ent_coef: temperature of ω: a number, ``"auto"`` to learn one for each of the ``n_rbf`` weights of a trajectory, or
-        ``"auto_0.1"`` to start at 0.1
-    :param duration_ent_coef: temperature of d, likewise
-    :param target_entropy: entropy of ω over the box [−1, 1] that a learned temperature keeps, or a function of the
-        remaining progress; ``"auto"`` is −dim(ω)
-    :param duration_target_entropy: likewise for d; ``"auto"`` is −1
-    :param duration_learning_rate: step size of d's head; ``learning_rate`` by default
+    :param ent_coef: temperature, a number, in the unit of β_h; ``"auto"`` to learn one for each of the ``n_rbf`` weights of a
+        trajectory and one for d, or ``"auto_0.1"`` to start them at 0.1
+    :param target_entropy: entropy of an option over the box [−1, 1] that learned temperatures keep, in equal parts for each
+        entry of ω and d, or a function of the remaining progress; ``"auto"`` is −dim(ω) − 1
     :param entropy_reference: ``"uniform"``, ``"average"`` or ``"paper"``, see :func:`log_reference_density`
-    :param canonical_options: whether critics see the same vector for all options that play the same actions, see
-        :class:`~sb3_ctco.ctco.canonical.CanonicalOptions`; without it they see ω and d as they are, the paper's way
     :param fast_updates: whether to compute gradients without autograd where that is known to give the same, see
         :mod:`sb3_ctco.ctco.fast_update`; ``fast_updates_refusal`` says why not where it is not
     :param action_noise: noise added to normalised options while exploring
     :param replay_buffer_class: ``OptionReplayBuffer`` or ``DictOptionReplayBuffer``, or a subclass
-    :param replay_buffer_kwargs: keyword arguments for the replay buffer
+    :param replay_buffer_kwargs: keyword arguments for the replay buffer, e.g. ``dict(reward_scale="auto")`` for values in a
+        unit that does not depend on that of rewards, see :class:`~sb3_ctco.common.buffers.OptionReplayBuffer`
     :param policy_kwargs: arguments of the policy, e.g. ``dict(net_arch=dict(pi=[10, 10], qf=[64, 64]))``
     :param stats_window_size: number of episodes that rollout statistics are averaged over
     :param tensorboard_log: log location for TensorBoard (None for no log)
@@ -107,10 +100,6 @@ class CTCO(SoftOptionActorCritic):
     """
 
     _own_setting: ClassVar[str] = "high_freq_penalty"
-    _before_it_was_saved: ClassVar[dict[str, Any]] = {
-        **SoftOptionActorCritic._before_it_was_saved,
-        "canonical_options": False,
-    }
 
     policy_aliases: ClassVar[dict[str, type[BasePolicy]]] = {
         "MlpPolicy": MlpPolicy,
@@ -145,16 +134,11 @@ class CTCO(SoftOptionActorCritic):
         trajectory: str | type[Trajectory] = "bezier",
         duration_scale: DurationScale = "log",
         join: Join = "free",
-        reward_scale: float | Literal["auto"] = 1.0,
         high_freq_penalty: float | Schedule = 0.003,
         target_decision_rate: float | None = None,
         ent_coef: str | float = "auto_0.02",
-        duration_ent_coef: str | float = "auto_0.02",
         target_entropy: str | float | Schedule = "auto",
-        duration_target_entropy: str | float | Schedule = "auto",
-        duration_learning_rate: float | Schedule | None = None,
         entropy_reference: EntropyReference = "uniform",
-        canonical_options: bool = True,
         fast_updates: bool = True,
         action_noise: ActionNoise | None = None,
         replay_buffer_class: type[ReplayBuffer] | None = None,
@@ -192,7 +176,6 @@ class CTCO(SoftOptionActorCritic):
             trajectory=trajectory,
             duration_scale=duration_scale,
             join=join,
-            reward_scale=reward_scale,
             gamma=gamma,
             gamma_dt=gamma_dt,
             updates_per_second=updates_per_second,
@@ -204,9 +187,8 @@ class CTCO(SoftOptionActorCritic):
             train_freq=train_freq,
             gradient_steps=gradient_steps,
             ent_coef=ent_coef,
-            duration_ent_coef=duration_ent_coef,
+            duration_ent_coef=ent_coef,
             target_entropy=target_entropy,
-            duration_target_entropy=duration_target_entropy,
             action_noise=action_noise,
             replay_buffer_class=replay_buffer_class,
             replay_buffer_kwargs=replay_buffer_kwargs,
@@ -219,9 +201,7 @@ class CTCO(SoftOptionActorCritic):
         )
         self.high_freq_penalty = high_freq_penalty
         self.target_decision_rate = target_decision_rate
-        self.canonical_options = canonical_options
         self.fast_updates = fast_updates
-        self.duration_learning_rate = duration_learning_rate
         self.entropy_reference: EntropyReference = entropy_reference
 
         if _init_setup_model:
@@ -255,11 +235,9 @@ class CTCO(SoftOptionActorCritic):
             "n_rbf": 3,
             "d_min": 0.0,
             "high_freq_penalty": 0.05,
-            "reward_scale": 1.0,
             "trajectory": "rbf",
             "duration_scale": "linear",
             "join": "free",
-            "canonical_options": False,
             "entropy_reference": "paper",
             "policy_kwargs": {"n_critics": 1, "net_arch": {"pi": [10, 10], "qf": [64, 64]}},
         }
@@ -271,9 +249,9 @@ class CTCO(SoftOptionActorCritic):
         self._parts = th.zeros(self.actor.omega_dim + 1, n + 1, device=self.device)
         self._parts[:-1, :n] = th.eye(n, device=self.device).repeat(self.actor.omega_dim // n, 1)
         self._parts[-1, -1] = 1.0
-        # None where it makes no difference or is not wanted
+        # None where it makes no difference or the trajectory does not want it
         self._canonical: CanonicalOptions | None = None
-        if self.canonical_options and not CanonicalOptions.makes_no_difference(space):
+        if space.trajectory.critics_see_canonical and not CanonicalOptions.makes_no_difference(space):
             self._canonical = CanonicalOptions(space, self.device)
         self._fast_update: FastUpdate | None = None
         #: Why updates were made with autograd in the last training; None if they were not
@@ -287,6 +265,18 @@ class CTCO(SoftOptionActorCritic):
         self._last_next_values: tuple[th.Tensor, th.Tensor] | None = None
         self._log_reference = log_reference_density(self._parts.sum(dim=0), space.d_min, space.d_max, self.entropy_reference)
 
+    @classmethod
+    def _arguments_of_older_files(cls, saved: dict[str, Any]) -> dict[str, Any]:
+        arguments = super()._arguments_of_older_files(saved)
+        targets = [saved.get("target_entropy"), saved.get("duration_target_entropy")]
+        if all(isinstance(target, float) for target in targets):
+            arguments["target_entropy"] = sum(targets)  # which was of ω alone, beside that of d
+        return arguments
+
+    def _after_load(self) -> None:
+        super()._after_load()
+        vars(self).pop("duration_target_entropy", None)
+
     def _networks_and_targets(self) -> list[tuple[nn.Module, nn.Module]]:
         return [*super()._networks_and_targets(), (self.actor, self.actor_target)]
 
@@ -298,14 +288,12 @@ class CTCO(SoftOptionActorCritic):
         # A short option feels little of its later weights: under one temperature these would have all of the entropy.
         return self.n_rbf
 
-    def _auto_target_entropies(self) -> tuple[float, float]:
-        return float(-self.actor.omega_dim), -1.0
+    def _auto_target_entropy(self) -> float:
+        return -1.0 - self.actor.omega_dim
 
-    def _update_learning_rate(self, optimizers: list[th.optim.Optimizer] | th.optim.Optimizer) -> None:
-        super()._update_learning_rate(optimizers)
-        if self.duration_learning_rate is not None:
-            step_size = FloatSchedule(self.duration_learning_rate)(self._current_progress_remaining)
-            self.actor.optimizer.param_groups[1]["lr"] = step_size
+    def _split_target_entropy(self, target: float) -> tuple[float, float]:
+        share = target / (self.actor.omega_dim + 1)
+        return share * self.actor.omega_dim, share
 
     def entropy_costs(self, log_prob: th.Tensor) -> th.Tensor:
         """β_E log π relative to the reference, each part's with its own temperature.

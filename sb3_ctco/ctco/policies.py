@@ -34,8 +34,7 @@ class OptionActor(SquashedActor):
     """π_θ(ω, d | s) of section "The Policy": independent Gaussians for ω and d, squashed into their boxes.
 
     An option is ``tanh(x)`` for ω and ``2·sigmoid(x) − 1`` for d, x being Gaussian with the heads' means and standard
-    deviations; the wrapper maps the latter to ``d_min + (d_max − d_min)·sigmoid(x)``. ω has a head of its own, and so
-    has d, whose step size may differ.
+    deviations; the wrapper maps the latter to [d_min, d_max]. ω has a head of its own, and so has d.
 
     Parameters are those of :class:`~sb3_ctco.common.policies.SquashedActor`; the option space has the shape
     ``[omega_dim + 1]``.
@@ -97,20 +96,17 @@ class CTCOPolicy(SoftOptionPolicy):
 
     def _build(self, lr_schedule: Schedule) -> None:
         super()._build(lr_schedule)
-        # A parameter group of its own lets d's head have its own step size.
-        head = set(self.actor.duration_head.parameters())
-        self.actor.optimizer = self.optimizer_class(
-            [
-                {"params": [p for p in self.actor.parameters() if p not in head]},
-                {"params": list(self.actor.duration_head.parameters())},
-            ],
-            lr=lr_schedule(1),  # type: ignore[call-arg]
-            **self.optimizer_kwargs,
-        )
+        self.actor.optimizer.register_load_state_dict_pre_hook(_in_one_group)
         self.actor_target = self.make_actor()
         self.actor_target.load_state_dict(self.actor.state_dict())
         self.actor_target.requires_grad_(False)
         self.actor_target.set_training_mode(False)
+
+
+def _in_one_group(_: th.optim.Optimizer, state: dict[str, Any]) -> dict[str, Any]:
+    """An optimizer's state with all parameters in one group; in files of 0.1.0 the last ones, of d's head, had their own."""
+    groups = state["param_groups"]
+    return {**state, "param_groups": [{**groups[0], "params": [p for group in groups for p in group["params"]]}]}
 
 
 MlpPolicy = CTCOPolicy

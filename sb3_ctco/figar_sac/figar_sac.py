@@ -13,7 +13,7 @@ from stable_baselines3.common.type_aliases import GymEnv, PyTorchObs, ReplayBuff
 from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_ctco.common.losses import critic_target, repeated_actor_loss, repetition_values
-from sb3_ctco.common.soft_actor_critic import SoftOptionActorCritic
+from sb3_ctco.common.soft_actor_critic import SoftOptionActorCritic, parse_target_entropy
 from sb3_ctco.figar_sac.policies import (
     CnnPolicy,
     FiGARActor,
@@ -157,7 +157,6 @@ class FiGARSAC(SoftOptionActorCritic):
             ent_coef=ent_coef,
             duration_ent_coef=duration_ent_coef,
             target_entropy=target_entropy,
-            duration_target_entropy=duration_target_entropy,
             action_noise=action_noise,
             replay_buffer_class=replay_buffer_class,
             replay_buffer_kwargs=replay_buffer_kwargs,
@@ -168,6 +167,7 @@ class FiGARSAC(SoftOptionActorCritic):
             seed=seed,
             device=device,
         )
+        self.duration_target_entropy = duration_target_entropy
         if _init_setup_model:
             self._setup_model()
 
@@ -231,9 +231,20 @@ class FiGARSAC(SoftOptionActorCritic):
         self.policy_kwargs = {**self.policy_kwargs, "n_repetitions": self.n_repetitions}
         super()._setup_model()
 
-    def _auto_target_entropies(self) -> tuple[float, float]:
-        assert self.n_repetitions is not None
-        return float(-self.actor.action_dim), 0.4 * math.log(self.n_repetitions)
+    def _setup_temperatures(self) -> None:
+        if isinstance(self.duration_target_entropy, str):
+            assert self.n_repetitions is not None
+            self.duration_target_entropy = parse_target_entropy(
+                "duration_target_entropy", self.duration_target_entropy, 0.4 * math.log(self.n_repetitions)
+            )
+        super()._setup_temperatures()
+
+    def _auto_target_entropy(self) -> float:
+        return float(-self.actor.action_dim)
+
+    def _split_target_entropy(self, target: float) -> tuple[float, float]:
+        assert not isinstance(self.duration_target_entropy, str)  # since the temperatures were set up
+        return target, self.duration_target_entropy
 
     def _sample_action(
         self, learning_starts: int, action_noise: ActionNoise | None = None, n_envs: int = 1

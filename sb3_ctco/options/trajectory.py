@@ -8,6 +8,7 @@ import math
 from abc import ABC, abstractmethod
 from dataclasses import dataclass
 from functools import lru_cache
+from typing import ClassVar
 
 import numpy as np
 import numpy.typing as npt
@@ -23,6 +24,9 @@ class Trajectory(ABC):
     :raises TypeError: if that is not an integer
     :raises ValueError: if it is less than one
     """
+
+    #: Whether the critics of CTCO see :meth:`canonical` weights, in place of weights as they are
+    critics_see_canonical: ClassVar[bool] = True
 
     n_weights: int
 
@@ -123,8 +127,11 @@ class Trajectory(ABC):
 class RadialBasis(Trajectory):
     """Normalised radial basis functions φ(t/d), the paper's options, equation (4). One weight repeats one action.
 
-    Centres stand at ``linspace(−0.5/n, 1 + 0.5/n, n)`` (0.5 for n = 1) with the variance ½((1 + 1/n)/n)².
+    Centres stand at ``linspace(−0.5/n, 1 + 0.5/n, n)`` (0.5 for n = 1) with the variance ½((1 + 1/n)/n)². As in the paper,
+    critics see weights as they are.
     """
+
+    critics_see_canonical = False
 
     def basis(self, phase: FloatArray) -> FloatArray:
         """Shape ``[n_steps, n_weights]``, see :meth:`Trajectory.basis`."""
