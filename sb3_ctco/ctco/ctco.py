@@ -301,7 +301,7 @@ class CTCO(SoftOptionActorCritic):
         :param log_prob: of each part, ``[batch, n_weights + 1]``
         :return: ``[batch, 1]``
         """
-        reference = log_prob.mean(dim=0) if self._log_reference is None else self._log_reference
+        reference = log_prob.detach().mean(dim=0) if self._log_reference is None else self._log_reference
         return ((log_prob - reference) @ self.ent_coefs)[:, None]
 
     def _sample_policy(self, obs: PyTorchObs) -> tuple[th.Tensor, ...]:
