@@ -578,6 +578,14 @@ def write_csv(file: Path, records: list[dict]) -> Path:
     return file
 
 
+def test_making_a_model_leaves_its_run_as_it_was():
+    """A record is known by its run's settings, and Stable-Baselines3 writes into the policy_kwargs that it is given."""
+    for run in load_preset("smoke").select(tasks=["point_mass"], rates=[50]):
+        before = run.fingerprint
+        agents.make_model(run).get_env().close()
+        assert run.fingerprint == before, run.name
+
+
 @pytest.mark.slow
 def test_collect_merges_and_skip_records_skips(finished, tmp_path, capsys):
     preset, folder = finished

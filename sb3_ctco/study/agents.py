@@ -1,5 +1,6 @@
 """From a run's settings to a model to train, and an environment to evaluate it in."""
 
+import copy
 import pydoc
 from typing import Any
 
@@ -19,7 +20,8 @@ def constructor_arguments(run: Run) -> dict[str, Any]:
     """
     where = f"preset {run.preset}: {run.algorithm} ({run.setting})"
     episode_seconds = find_task(run.task).seconds_of_episode(run.rate)
-    arguments = ALGORITHMS[run.algorithm].arguments(run.arguments, run.dt, episode_seconds, where)
+    # A copy, since Stable-Baselines3 writes into policy_kwargs, and the run's are what its record is known by.
+    arguments = ALGORITHMS[run.algorithm].arguments(copy.deepcopy(run.arguments), run.dt, episode_seconds, where)
     policy_kwargs = arguments.get("policy_kwargs", {})
     if "features_extractor_class" in policy_kwargs:
         name = policy_kwargs["features_extractor_class"]
