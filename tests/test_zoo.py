@@ -28,6 +28,8 @@ TUNED = {
     "MountainCarContinuous-v0",
     "Hopper-v5",
     "HalfCheetah-v5",
+    "Walker2d-v5",
+    "Reacher-v5",
     *(
         f"sb3_ctco/{task}-{rate}hz-v0"
         for task in ("point_mass-sparse", "cheetah-run", "ball_in_cup-catch")
