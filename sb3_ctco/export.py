@@ -9,7 +9,8 @@ from gymnasium import spaces
 from stable_baselines3.common.vec_env import VecNormalize
 from torch import nn
 
-from sb3_ctco.controller import METADATA_KEY, ModelPolicy, to_metadata
+from sb3_ctco.controller import ModelPolicy
+from sb3_ctco.exported import METADATA_KEY, to_metadata
 
 if TYPE_CHECKING:
     from sb3_ctco.common.option_algorithm import OptionOffPolicyAlgorithm

@@ -13,8 +13,8 @@ from stable_baselines3 import SAC
 from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 
 from sb3_ctco import CTCO, DACPPO, FiGARSAC, OptionController, OptionExecutionWrapper
-from sb3_ctco.controller import OnnxPolicy, to_metadata
 from sb3_ctco.export import export_onnx
+from sb3_ctco.exported import OnnxPolicy, to_metadata
 from sb3_ctco.options import OptionSpace, RadialBasis
 
 DT = 0.1

@@ -19,9 +19,10 @@ from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 
 from sb3_ctco import CTCO, FiGARSAC, OptionController, OptionExecutionWrapper
 from sb3_ctco.checkpoint import load_checkpoint, save_checkpoint
-from sb3_ctco.controller import METADATA_KEY, ModelPolicy, OnnxPolicy
+from sb3_ctco.controller import ModelPolicy
 from sb3_ctco.evaluation import evaluate_discounted_return, largest_jump, mean_absolute_jerk
 from sb3_ctco.export import export_onnx
+from sb3_ctco.exported import METADATA_KEY, OnnxPolicy
 from sb3_ctco.options import (
     JOINS,
     LAST_ACTION,
