@@ -8,7 +8,7 @@ import numpy as np
 import numpy.typing as npt
 from gymnasium import spaces
 
-from sb3_ctco.options import LAST_ACTION, OptionSpace
+from sb3_ctco.options import LAST_ACTION, OPTIONS_OF_0_1_0, OptionSpace
 
 Observation = npt.NDArray[Any] | dict[str, npt.NDArray[Any]]
 
@@ -110,8 +110,6 @@ _SETTINGS: dict[str, tuple[type, ...]] = {
     "duration_scale": (str,),
     "join": (str,),
 }
-#: Of files that do not say so
-_OF_0_1_0 = {"trajectory": "rbf", "duration_scale": "linear", "join": "free"}
 
 #: Name of a dtype of numbers, as numpy has it, and what ONNX calls it
 _ONNX_TYPES = {
@@ -131,7 +129,7 @@ def _from_metadata(text: str) -> tuple[OptionSpace, spaces.Box, dict[str, tuple[
     data = json.loads(text)
     # Files that 0.1.0 wrote have it under another name.
     settings = data["option_space"] if "option_space" in data else data["option_settings"]
-    settings = {**_OF_0_1_0, **settings} if isinstance(settings, dict) else settings
+    settings = {**OPTIONS_OF_0_1_0, **settings} if isinstance(settings, dict) else settings
     if not isinstance(settings, dict) or settings.keys() != _SETTINGS.keys():
         raise ValueError(f"option_space must have {list(_SETTINGS)}, not {settings}")
     for name, value in settings.items():

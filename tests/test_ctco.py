@@ -262,8 +262,10 @@ def test_the_scale_that_was_found_stays(tmp_path, random_walk_env):
     assert found > 0
     resumed = CTCO.load(tmp_path / "model", env=random_walk_env())
     assert resumed.replay_buffer.reward_scale == found
-    for given in ({}, {"reward_scale": 2.0}, None):
+    for given in ({}, {"reward_scale": found}, {"reward_scale": "auto"}, None):
         assert CTCO.load(tmp_path / "model", replay_buffer_kwargs=given).replay_buffer.reward_scale == found
+    with pytest.raises(ValueError, match=r"reward_scale=2.0 cannot be changed while loading: .* reward_scale="):
+        CTCO.load(tmp_path / "model", replay_buffer_kwargs={"reward_scale": 2.0})
     model.save_replay_buffer(tmp_path / "buffer")
     resumed.load_replay_buffer(tmp_path / "buffer")
     assert resumed.learn(30, reset_num_timesteps=False).replay_buffer.reward_scale == found

@@ -44,7 +44,7 @@ from sb3_ctco.common.buffers import DictOptionReplayBuffer, OptionReplayBuffer
 from sb3_ctco.common.callbacks import OptionProgressBarCallback, PrimitiveStepCallback, eval_callbacks
 from sb3_ctco.common.load_arguments import check_load_arguments
 from sb3_ctco.option_array import OptionArray
-from sb3_ctco.options import DurationScale, Join, OptionSpace, Trajectory, discount_rate_from_gamma
+from sb3_ctco.options import OPTIONS_OF_0_1_0, DurationScale, Join, OptionSpace, Trajectory, discount_rate_from_gamma
 from sb3_ctco.vec_env import PLAYED, AsyncOptionVecEnv
 from sb3_ctco.wrappers import OptionExecutionWrapper, find_dt
 
@@ -94,13 +94,6 @@ class OptionOffPolicyAlgorithm(OffPolicyAlgorithm):
     )
     #: An attribute that this class's files have and others' have not
     _own_setting: ClassVar[str] = "discount_rate"
-
-    #: Of arguments that older files do not have: what their networks were trained with
-    _before_it_was_saved: ClassVar[dict[str, Any]] = {
-        "trajectory": "rbf",
-        "duration_scale": "linear",
-        "join": "free",
-    }
 
     def __init__(
         self,
@@ -326,9 +319,14 @@ class OptionOffPolicyAlgorithm(OffPolicyAlgorithm):
         if saved:
             kwargs = {**cls._arguments_of_older_files(saved), **kwargs}
         if "replay_buffer_kwargs" in kwargs:
-            # Critics learned with the file's unit of values.
+            given = kwargs["replay_buffer_kwargs"] or {}
             unit = saved.get("replay_buffer_kwargs", {}).get("reward_scale", 1.0)
-            kwargs["replay_buffer_kwargs"] = {**(kwargs["replay_buffer_kwargs"] or {}), "reward_scale": unit}
+            if given.get("reward_scale", "auto") not in ("auto", unit):
+                raise ValueError(
+                    f"reward_scale={given['reward_scale']} cannot be changed while loading: the file's critics learned with "
+                    f"reward_scale={unit}. Leave it out, or make a new model"
+                )
+            kwargs["replay_buffer_kwargs"] = {**given, "reward_scale": unit}
         # Of two that say the same in different ways, the one that is given holds.
         if "gradient_steps" in kwargs:
             kwargs.setdefault("updates_per_second", None)
@@ -351,7 +349,7 @@ class OptionOffPolicyAlgorithm(OffPolicyAlgorithm):
 
         :param saved: what the file says of the model's attributes
         """
-        return {name: value for name, value in cls._before_it_was_saved.items() if name not in saved}
+        return {name: value for name, value in OPTIONS_OF_0_1_0.items() if name not in saved}
 
     def _after_load(self) -> None:
         """What is left to do when a file has been read; nothing here."""

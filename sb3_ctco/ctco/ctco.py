@@ -269,7 +269,7 @@ class CTCO(SoftOptionActorCritic):
     def _arguments_of_older_files(cls, saved: dict[str, Any]) -> dict[str, Any]:
         arguments = super()._arguments_of_older_files(saved)
         targets = [saved.get("target_entropy"), saved.get("duration_target_entropy")]
-        if all(isinstance(target, float) for target in targets):
+        if all(isinstance(target, int | float) for target in targets):
             arguments["target_entropy"] = sum(targets)  # which was of ω alone, beside that of d
         return arguments
 

@@ -33,7 +33,16 @@ from sb3_ctco.options.semi_mdp import (
     step_weight,
     steps_in,
 )
-from sb3_ctco.options.space import DURATION_SCALES, JOINS, ActionBox, DurationScale, Join, OptionSpace, default_durations
+from sb3_ctco.options.space import (
+    DURATION_SCALES,
+    JOINS,
+    OPTIONS_OF_0_1_0,
+    ActionBox,
+    DurationScale,
+    Join,
+    OptionSpace,
+    default_durations,
+)
 from sb3_ctco.options.sub_options import Stacked, SubOptions, draw_stretches, rows_of, shortest_steps, stack, sub_options
 from sb3_ctco.options.trajectory import TRAJECTORIES, BezierCurve, RadialBasis, Trajectory, basis_of_steps
 
@@ -43,6 +52,7 @@ __all__ = [
     "JOINS",
     "LAST_ACTION",
     "OBSERVATION",
+    "OPTIONS_OF_0_1_0",
     "PLAYED",
     "REWARD_UNITS",
     "TAKEN_OVER",

@@ -13,6 +13,8 @@ from sb3_ctco.options.trajectory import TRAJECTORIES, Trajectory
 DurationScale = Literal["log", "linear"]
 DURATION_SCALES: tuple[DurationScale, ...] = ("log", "linear")
 Join = Literal["free", "continuous", "smooth"]
+#: Settings of options in files of 0.1.0, which do not say so: there was nothing else
+OPTIONS_OF_0_1_0 = {"trajectory": "rbf", "duration_scale": "linear", "join": "free"}
 #: Each at the index of how many of its first points an option is given by what was sent before it
 JOINS: tuple[Join, ...] = ("free", "continuous", "smooth")
 
