@@ -51,6 +51,8 @@ class _OptionStorage(ReplayBuffer):
     n_demonstrations = 0
     option_space: OptionSpace | None = None
     primitive_action_space: spaces.Box | None = None
+    _stored_rewards = 0.0
+    _stored_seconds = 0.0
 
     def __init__(
         self,
@@ -162,6 +164,8 @@ class _OptionStorage(ReplayBuffer):
             self._move_to(position + 1)
             self.n_decisions += 1
             self.decision_seconds += option["duration"]
+            self._stored_rewards += abs(option["integrated_reward"])
+            self._stored_seconds += option["duration"]
             if i in sub_options:
                 self._add_sub_options(sub_options[i])
 
@@ -265,6 +269,11 @@ class _OptionStorage(ReplayBuffer):
         return self._n_experienced + self.n_demonstrations
 
     @property
+    def mean_reward_rate(self) -> float:
+        """What an option pays a second: the mean of |R| by the mean duration, of all that was ever stored; 0 of nothing."""
+        return self._stored_rewards / self._stored_seconds if self._stored_seconds else 0.0
+
+    @property
     def _n_experienced(self) -> int:
         """Rows of what the policy did, the first ones."""
         return self.buffer_size - self.n_demonstrations if self.full else self.pos
@@ -313,6 +322,8 @@ class _OptionStorage(ReplayBuffer):
         # What primitive steps paid in sum is not kept of a sub-option; samples have R.
         self.rewards[rows, 0] = self.integrated_rewards[rows, 0] = sub_options.integrated_rewards
         self.durations[rows, 0] = sub_options.durations
+        self._stored_rewards += float(np.abs(sub_options.integrated_rewards).sum())
+        self._stored_seconds += float(np.sum(sub_options.durations))
         self.dones[rows, 0] = sub_options.terminated | sub_options.truncated
         self.timeouts[rows, 0] = sub_options.truncated & self.handle_timeout_termination
 

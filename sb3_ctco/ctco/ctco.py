@@ -22,6 +22,25 @@ from sb3_ctco.ctco.policies import CnnPolicy, CTCOPolicy, MlpPolicy, MultiInputP
 from sb3_ctco.options import DurationScale, Join, Trajectory, default_durations, discount_rate_from_gamma
 
 
+def _parse_penalty(value: float | str | Schedule) -> tuple[float | Schedule, bool]:
+    """β_h or what it is a multiple of, and whether it is one.
+
+    :raises ValueError: if ``value`` is neither a number nor a function nor ``"relative_<number of at least 0>"``
+    """
+    if not isinstance(value, str):
+        return value, False
+    try:
+        coefficient = float(value.removeprefix("relative_")) if value.startswith("relative_") else -1.0
+    except ValueError:
+        coefficient = -1.0
+    if not 0.0 <= coefficient < math.inf:
+        raise ValueError(
+            f"high_freq_penalty must be a number, a function of the remaining progress, or 'relative_<number of at least 0>', "
+            f"such as 'relative_0.1', not {value!r}"
+        )
+    return coefficient, True
+
+
 def _longest(d_max: float | None, gamma: float, gamma_dt: float) -> float:
     """The longest duration, in s: by default what follows from the discount."""
     return default_durations(discount_rate_from_gamma(gamma, gamma_dt))[1] if d_max is None else d_max
@@ -74,8 +93,9 @@ class CTCO(SoftOptionActorCritic):
     :param join: where an option's actions begin: wherever its weights say (``"free"``, the paper's way), at the action that
         is being sent then (``"continuous"``), or there and at the slope at which actions were changing (``"smooth"``), see
         :class:`~sb3_ctco.wrappers.OptionExecutionWrapper`
-    :param high_freq_penalty: β_h, subtracted once a decision in the critic's target, or a function of the remaining
-        progress; in the unit of R, times the buffer's ``reward_scale``
+    :param high_freq_penalty: β_h, subtracted once a decision in the critic's target: a number, or a function of the remaining
+        progress, in the unit of R times the buffer's ``reward_scale``; or ``"relative_0.1"`` for a tenth of what is paid in
+        ``d_min`` on average, the mean of abs(R) a second of all options so far, which depends on no unit
     :param target_decision_rate: in Hz, in place of a fixed β_h: ``high_freq_penalty`` is where β_h starts, and it rises
         while the policy decides more often than this, and falls while it decides less often
     :param ent_coef: temperature, a number, in the unit of β_h; ``"auto"`` to learn one for each of the ``n_rbf`` weights of a
@@ -134,7 +154,7 @@ class CTCO(SoftOptionActorCritic):
         trajectory: str | type[Trajectory] = "bezier",
         duration_scale: DurationScale = "log",
         join: Join = "free",
-        high_freq_penalty: float | Schedule = 0.003,
+        high_freq_penalty: float | str | Schedule = 0.003,
         target_decision_rate: float | None = None,
         ent_coef: str | float = "auto_0.02",
         target_entropy: str | float | Schedule = "auto",
@@ -160,9 +180,10 @@ class CTCO(SoftOptionActorCritic):
             )
         if target_decision_rate is not None and not target_decision_rate > 0:
             raise ValueError(f"target_decision_rate must be a positive number of Hz or None, not {target_decision_rate}")
-        if target_decision_rate is not None and not (isinstance(high_freq_penalty, int | float) and high_freq_penalty > 0):
+        coefficient, _ = _parse_penalty(high_freq_penalty)
+        if target_decision_rate is not None and not (isinstance(coefficient, int | float) and coefficient > 0):
             raise ValueError(
-                f"with a target_decision_rate, high_freq_penalty={high_freq_penalty} must be a positive number: "
+                f"with a target_decision_rate, high_freq_penalty={high_freq_penalty} must be a positive number, or relative: "
                 "β_h starts there, and its logarithm is learned"
             )
         super().__init__(
@@ -200,6 +221,8 @@ class CTCO(SoftOptionActorCritic):
             device=device,
         )
         self.high_freq_penalty = high_freq_penalty
+        #: What a relative β_h is a multiple of, as of the last training: nothing before it
+        self._penalty_unit = 0.0
         self.target_decision_rate = target_decision_rate
         self.fast_updates = fast_updates
         self.entropy_reference: EntropyReference = entropy_reference
@@ -257,8 +280,9 @@ class CTCO(SoftOptionActorCritic):
         #: Why updates were made with autograd in the last training; None if they were not
         self.fast_updates_refusal: str | None = None
         if self.target_decision_rate is not None:
-            assert isinstance(self.high_freq_penalty, int | float)
-            self.log_high_freq_penalty = th.tensor(math.log(self.high_freq_penalty), requires_grad=True)
+            coefficient, _ = _parse_penalty(self.high_freq_penalty)
+            assert isinstance(coefficient, int | float)
+            self.log_high_freq_penalty = th.tensor(math.log(coefficient), requires_grad=True)
             self.high_freq_penalty_optimizer = th.optim.Adam([self.log_high_freq_penalty], lr=self.lr_schedule(1))
             #: What the replay buffer had counted at the last training: decisions, and their time in s; a file's goes on.
             self._counted_decisions: tuple[int, float] = getattr(self, "_counted_decisions", (0, 0.0))
@@ -348,6 +372,11 @@ class CTCO(SoftOptionActorCritic):
         """
         if self.target_decision_rate is not None:
             self._update_high_freq_penalty()
+        assert isinstance(self.replay_buffer, OptionReplayBuffer | DictOptionReplayBuffer)
+        scale = self.replay_buffer.reward_scale
+        # "auto" is found with the first sample; until then nothing is charged.
+        paid = 0.0 if isinstance(scale, str) else scale * self.replay_buffer.mean_reward_rate
+        self._penalty_unit = paid * max(self.option_space.d_min, self.option_space.dt)
         super().train(gradient_steps, batch_size)
         self.logger.record("option/high_freq_penalty", self._current_high_freq_penalty())
         if self._last_next_values is None:
@@ -379,10 +408,11 @@ class CTCO(SoftOptionActorCritic):
             self._fast_update.store()
 
     def _current_high_freq_penalty(self) -> float:
-        if self.target_decision_rate is not None:
-            return math.exp(self.log_high_freq_penalty.item())
         # Read anew, so that it can be changed between trainings.
-        return FloatSchedule(self.high_freq_penalty)(self._current_progress_remaining)
+        coefficient, relative = _parse_penalty(self.high_freq_penalty)
+        if self.target_decision_rate is not None:
+            coefficient = math.exp(self.log_high_freq_penalty.item())
+        return FloatSchedule(coefficient)(self._current_progress_remaining) * (self._penalty_unit if relative else 1.0)
 
     def _update_high_freq_penalty(self) -> None:
         """Dual ascent on log β_h, as SAC's on its temperature, with the decisions since the last training.
