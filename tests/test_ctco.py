@@ -236,12 +236,13 @@ def test_a_reward_scale_that_is_none(scale, random_walk_env):
 
 
 @pytest.mark.parametrize("fast", [True, False])
-def test_units_make_no_difference(fast):
+@pytest.mark.parametrize("penalty", [0.003, "relative_0.1"])
+def test_units_make_no_difference(penalty, fast):
     """Rewards in another unit, or γ over another gamma_dt: the same networks, but for rounding."""
 
     def learned(factor=1.0, gamma=0.98, gamma_dt=0.05):
         env = gym.wrappers.TransformReward(gym.make("Pendulum-v1"), lambda r: factor * r)
-        unit = {"replay_buffer_kwargs": {"reward_scale": "auto"}}
+        unit = {"replay_buffer_kwargs": {"reward_scale": "auto"}, "high_freq_penalty": penalty}
         settings = {"gamma": gamma, "gamma_dt": gamma_dt, "d_max": 0.3, "fast_updates": fast, **unit}
         model = make(env, n_sub_options=2, learning_starts=50, policy_kwargs={"net_arch": [16]}, **settings).learn(200)
         assert model._n_updates > 50
@@ -252,6 +253,33 @@ def test_units_make_no_difference(fast):
     th.testing.assert_close(learned(factor=100.0), weights, rtol=1e-3, atol=1e-3)
     th.testing.assert_close(learned(factor=0.01), weights, rtol=1e-3, atol=1e-3)
     th.testing.assert_close(learned(gamma=0.98**2, gamma_dt=0.1), weights, rtol=1e-3, atol=1e-3)
+
+
+@pytest.mark.parametrize("scale", [1.0, 5.0, "auto"])
+def test_a_relative_penalty_follows_what_is_paid(scale, tmp_path):
+    """−3 at each of 30 steps of 0.05 s, so what options pay a second is 3, less what is discounted within them."""
+    env = gym.wrappers.TransformReward(gym.make("Pendulum-v1"), lambda r: -3.0)
+    settings = {"d_min": 0.1, "d_max": 0.1001, "n_sub_options": 2, "learning_starts": 20, "high_freq_penalty": "relative_0.5"}
+    model = make(env, replay_buffer_kwargs={"reward_scale": scale}, **settings)
+    assert model._current_high_freq_penalty() == 0.0  # nothing was paid
+    model.learn(30)
+    buffer = model.replay_buffer
+    size = buffer.size()
+    rate = np.abs(buffer.integrated_rewards[:size]).sum() / buffer.durations[:size].sum()
+    assert 2.9 < rate < 3.0
+    assert buffer.mean_reward_rate == pytest.approx(rate)
+    model.train(1, 8)
+    # Half of 3 for 0.1 s, in the unit of the critics
+    assert model._current_high_freq_penalty() == pytest.approx(0.5 * rate * 0.1 * buffer.reward_scale)
+    assert model.logger.name_to_value["option/high_freq_penalty"] == model._current_high_freq_penalty()
+    model.save(tmp_path / "model")
+    assert CTCO.load(tmp_path / "model")._current_high_freq_penalty() == model._current_high_freq_penalty()
+
+
+def test_a_relative_penalty_is_at_least_that_of_a_step():
+    model = make(gym.make("Pendulum-v1"), d_min=0.0, learning_starts=20, high_freq_penalty="relative_0.1").learn(30)
+    model.train(1, 8)
+    assert model._current_high_freq_penalty() == pytest.approx(0.1 * model.replay_buffer.mean_reward_rate * 0.05)
 
 
 def test_the_scale_that_was_found_stays(tmp_path, random_walk_env):
@@ -395,6 +423,14 @@ def test_the_penalty_is_found_that_keeps_a_decision_rate(decision_rate):
     decisions, seconds = np.subtract(rates[-1], rates[half])
     assert decisions / seconds == pytest.approx(decision_rate, rel=0.1)
     assert np.mean(penalties[half:]) == pytest.approx(penalty_of(decision_rate), rel=0.2)
+
+
+def test_a_relative_penalty_may_be_found():
+    model = make(StaleOptionsEnv(), target_decision_rate=3.0, learning_rate=0.01, high_freq_penalty="relative_0.5").learn(200)
+    coefficient = math.exp(model.log_high_freq_penalty.item())
+    assert coefficient != pytest.approx(0.5)
+    assert model._current_high_freq_penalty() == pytest.approx(coefficient * model._penalty_unit)
+    assert model._penalty_unit > 0
 
 
 def test_a_decision_rate_is_kept_from_above_only():
@@ -725,6 +761,11 @@ def test_action_noise(random_walk_env):
         ({"entropy_reference": "gaussian"}, "entropy_reference"),
         ({"target_decision_rate": 0.0}, "target_decision_rate must be a positive number of Hz"),
         ({"target_decision_rate": 5.0, "high_freq_penalty": 0.0}, "high_freq_penalty=0.0 must be a positive number"),
+        ({"target_decision_rate": 5.0, "high_freq_penalty": "relative_0"}, "high_freq_penalty=relative_0 must be a positive"),
+        ({"high_freq_penalty": "auto"}, "'relative_<number of at least 0>', such as 'relative_0.1', not 'auto'"),
+        ({"high_freq_penalty": "relative_-1"}, "not 'relative_-1'"),
+        ({"high_freq_penalty": "relative_inf"}, "not 'relative_inf'"),
+        ({"high_freq_penalty": "relative_a"}, "not 'relative_a'"),
         ({"replay_buffer_class": ReplayBuffer}, "OptionReplayBuffer"),
         ({"replay_buffer_kwargs": {"optimize_memory_usage": True}}, "optimize_memory_usage"),
         ({"policy_kwargs": {"n_critics": 0}}, "n_critics"),
