@@ -372,11 +372,7 @@ class CTCO(SoftOptionActorCritic):
         """
         if self.target_decision_rate is not None:
             self._update_high_freq_penalty()
-        assert isinstance(self.replay_buffer, OptionReplayBuffer | DictOptionReplayBuffer)
-        scale = self.replay_buffer.reward_scale
-        # "auto" is found with the first sample; until then nothing is charged.
-        paid = 0.0 if isinstance(scale, str) else scale * self.replay_buffer.mean_reward_rate
-        self._penalty_unit = paid * max(self.option_space.d_min, self.option_space.dt)
+        self._penalty_unit = self._paid_in_the_shortest_option()
         super().train(gradient_steps, batch_size)
         self.logger.record("option/high_freq_penalty", self._current_high_freq_penalty())
         if self._last_next_values is None:
@@ -413,6 +409,14 @@ class CTCO(SoftOptionActorCritic):
         if self.target_decision_rate is not None:
             coefficient = math.exp(self.log_high_freq_penalty.item())
         return FloatSchedule(coefficient)(self._current_progress_remaining) * (self._penalty_unit if relative else 1.0)
+
+    def _paid_in_the_shortest_option(self) -> float:
+        """What a relative β_h is a multiple of: mean abs(R) a second, times ``d_min``, in the unit of the critics."""
+        assert isinstance(self.replay_buffer, OptionReplayBuffer | DictOptionReplayBuffer)
+        scale = self.replay_buffer.reward_scale
+        if isinstance(scale, str):
+            return 0.0  # "auto" is found with the first sample.
+        return scale * self.replay_buffer.mean_reward_rate * max(self.option_space.d_min, self.option_space.dt)
 
     def _update_high_freq_penalty(self) -> None:
         """Dual ascent on log β_h, as SAC's on its temperature, with the decisions since the last training.
