@@ -214,10 +214,11 @@ def test_a_scale_that_does_not_depend_on_the_unit_of_rewards(kind):
 @pytest.mark.parametrize("kind", ["vector", "dict"])
 def test_what_options_pay_a_second(kind):
     buffer = make_buffer(kind)
-    assert buffer.mean_reward_rate == 0.0
-    add(buffer, kind, 0, [option_info(1.0, 3.0)])
-    add(buffer, kind, 1, [option_info(2.0, -4.5)])
-    assert buffer.mean_reward_rate == 7.5 / 3.0  # what is lost counts, too
+    add(buffer, kind, 0, [option_info(1.0, 0.0)])
+    assert buffer.mean_reward_rate == 1.0  # Nothing was paid.
+    add(buffer, kind, 1, [option_info(1.0, 3.0)])
+    add(buffer, kind, 2, [option_info(2.0, -4.5)])
+    assert buffer.mean_reward_rate == 7.5 / 3.0  # what is lost counts, too; what pays nothing does not
 
 
 @pytest.mark.parametrize("kind", ["vector", "dict"])

@@ -261,7 +261,6 @@ def test_a_relative_penalty_follows_what_is_paid(scale, tmp_path):
     env = gym.wrappers.TransformReward(gym.make("Pendulum-v1"), lambda r: -3.0)
     settings = {"d_min": 0.1, "d_max": 0.1001, "n_sub_options": 2, "learning_starts": 20, "high_freq_penalty": "relative_0.5"}
     model = make(env, replay_buffer_kwargs={"reward_scale": scale}, **settings)
-    assert model._current_high_freq_penalty() == 0.0  # nothing was paid
     model.learn(30)
     buffer = model.replay_buffer
     size = buffer.size()
@@ -274,6 +273,13 @@ def test_a_relative_penalty_follows_what_is_paid(scale, tmp_path):
     assert model.logger.name_to_value["option/high_freq_penalty"] == model._current_high_freq_penalty()
     model.save(tmp_path / "model")
     assert CTCO.load(tmp_path / "model")._current_high_freq_penalty() == model._current_high_freq_penalty()
+
+
+def test_before_anything_was_paid_a_relative_penalty_is_that_of_a_reward_of_one():
+    env = gym.wrappers.TransformReward(gym.make("Pendulum-v1"), lambda r: 0.0)
+    model = make(env, d_min=0.1, d_max=0.2, learning_starts=20, high_freq_penalty="relative_0.5").learn(30)
+    model.train(1, 8)
+    assert model._current_high_freq_penalty() == pytest.approx(0.5 * 0.1)
 
 
 def test_a_relative_penalty_is_at_least_that_of_a_step():

@@ -51,8 +51,8 @@ class _OptionStorage(ReplayBuffer):
     n_demonstrations = 0
     option_space: OptionSpace | None = None
     primitive_action_space: spaces.Box | None = None
-    _stored_rewards = 0.0
-    _stored_seconds = 0.0
+    _paid = 0.0
+    _paid_seconds = 0.0
 
     def __init__(
         self,
@@ -164,8 +164,7 @@ class _OptionStorage(ReplayBuffer):
             self._move_to(position + 1)
             self.n_decisions += 1
             self.decision_seconds += option["duration"]
-            self._stored_rewards += abs(option["integrated_reward"])
-            self._stored_seconds += option["duration"]
+            self._count_paid(self.integrated_rewards[position], self.durations[position])
             if i in sub_options:
                 self._add_sub_options(sub_options[i])
 
@@ -270,8 +269,12 @@ class _OptionStorage(ReplayBuffer):
 
     @property
     def mean_reward_rate(self) -> float:
-        """What an option pays a second: the mean of |R| by the mean duration, of all that was ever stored; 0 of nothing."""
-        return self._stored_rewards / self._stored_seconds if self._stored_seconds else 0.0
+        """What options pay a second: mean of |R| by mean duration, of all so far that paid anything; 1 before the first."""
+        return self._paid / self._paid_seconds if self._paid_seconds else 1.0
+
+    def _count_paid(self, integrated_rewards: np.ndarray, durations: np.ndarray) -> None:
+        self._paid += float(np.abs(integrated_rewards).sum())
+        self._paid_seconds += float(np.sum(durations[integrated_rewards != 0]))
 
     @property
     def _n_experienced(self) -> int:
@@ -322,8 +325,7 @@ class _OptionStorage(ReplayBuffer):
         # What primitive steps paid in sum is not kept of a sub-option; samples have R.
         self.rewards[rows, 0] = self.integrated_rewards[rows, 0] = sub_options.integrated_rewards
         self.durations[rows, 0] = sub_options.durations
-        self._stored_rewards += float(np.abs(sub_options.integrated_rewards).sum())
-        self._stored_seconds += float(np.sum(sub_options.durations))
+        self._count_paid(sub_options.integrated_rewards, sub_options.durations)
         self.dones[rows, 0] = sub_options.terminated | sub_options.truncated
         self.timeouts[rows, 0] = sub_options.truncated & self.handle_timeout_termination
 
@@ -345,15 +347,15 @@ class _OptionStorage(ReplayBuffer):
             "actions": self._tensor(rows(self.actions)),
             "next_observations": observations(self.next_observations),
             "dones": self._tensor(dones[:, None]),
-            "rewards": self._tensor(rewards) * self._found_reward_scale(rewards),
+            "rewards": self._tensor(rewards) * self.found_reward_scale(),
             "discounts": self._tensor(discount(rows(self.durations), self.discount_rate)[:, None]),
         }
 
-    def _found_reward_scale(self, rewards: np.ndarray) -> float:
-        """What samples with these rewards are multiplied by."""
+    def found_reward_scale(self) -> float:
+        """What R is multiplied by in samples; ``"auto"`` is found now, if anything was paid yet, and 1 until then."""
         if self.reward_scale != "auto":
             return self.reward_scale
-        if not rewards.any():
+        if not self._paid:
             return 1.0  # To nothing every scale is the same.
         paid = self.integrated_rewards != 0
         # Without a discount, forever is 100 s.
@@ -461,7 +463,7 @@ class OptionReplayBuffer(_OptionStorage):
     and an environment wrapped in :class:`~sb3_ctco.wrappers.OptionExecutionWrapper` they learn on the semi-Markov process.
 
     :param discount_rate: τ, in 1/s; the wrapper's
-    :param reward_scale: what R is multiplied by in samples. ``"auto"`` finds it at the first sample in which something was
+    :param reward_scale: what R is multiplied by in samples. ``"auto"`` finds it at the first sample after something was
         paid, and keeps it: the best (or worst) option so far, R/(1 − γ(d)) if it were repeated forever, is worth 100. That
         does not depend on the unit of rewards, and it is what a reward of 1 a step is worth to SAC with its usual discount
         of 0.99

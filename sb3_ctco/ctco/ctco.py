@@ -95,7 +95,7 @@ class CTCO(SoftOptionActorCritic):
         :class:`~sb3_ctco.wrappers.OptionExecutionWrapper`
     :param high_freq_penalty: β_h, subtracted once a decision in the critic's target: a number, or a function of the remaining
         progress, in the unit of R times the buffer's ``reward_scale``; or ``"relative_0.1"`` for a tenth of what is paid in
-        ``d_min`` on average, the mean of abs(R) a second of all options so far, which depends on no unit
+        ``d_min`` on average, by all options so far that paid anything, which depends on no unit
     :param target_decision_rate: in Hz, in place of a fixed β_h: ``high_freq_penalty`` is where β_h starts, and it rises
         while the policy decides more often than this, and falls while it decides less often
     :param ent_coef: temperature, a number, in the unit of β_h; ``"auto"`` to learn one for each of the ``n_rbf`` weights of a
@@ -413,10 +413,8 @@ class CTCO(SoftOptionActorCritic):
     def _paid_in_the_shortest_option(self) -> float:
         """What a relative β_h is a multiple of: mean abs(R) a second, times ``d_min``, in the unit of the critics."""
         assert isinstance(self.replay_buffer, OptionReplayBuffer | DictOptionReplayBuffer)
-        scale = self.replay_buffer.reward_scale
-        if isinstance(scale, str):
-            return 0.0  # "auto" is found with the first sample.
-        return scale * self.replay_buffer.mean_reward_rate * max(self.option_space.d_min, self.option_space.dt)
+        paid_a_second = self.replay_buffer.found_reward_scale() * self.replay_buffer.mean_reward_rate
+        return paid_a_second * max(self.option_space.d_min, self.option_space.dt)
 
     def _update_high_freq_penalty(self) -> None:
         """Dual ascent on log β_h, as SAC's on its temperature, with the decisions since the last training.
