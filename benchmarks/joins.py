@@ -1,6 +1,5 @@
 """Free, continuous and smooth joins: returns, jerk and jumps of trained policies, and a picture of their actions.
 
-    sb3-ctco study run --preset quick --rates 500 --settings tuned --seeds 0 1 2 --folder runs/study/joins
     sb3-ctco study run --preset benchmarks/joins.yml
     python benchmarks/joins.py table runs/study/joins
     python benchmarks/joins.py figure runs/study/joins --task cheetah --output docs/images/joins.png

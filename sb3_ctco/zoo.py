@@ -49,6 +49,7 @@ def convert_ctco_params(sampled_params: dict[str, Any]) -> dict[str, Any]:
     """CTCO's arguments from what :func:`sample_ctco_params` suggested (and Optuna stored)."""
     hyperparams = dict(sampled_params)
     hyperparams["ent_coef"] = f"auto_{hyperparams.pop('ent_coef_start')}"
+    hyperparams["high_freq_penalty"] = f"relative_{hyperparams.pop('relative_penalty')}"
     # In place of a file's gradient_steps, which updates_per_second contradicts.
     hyperparams["gradient_steps"] = -1
     return hyperparams
@@ -69,7 +70,7 @@ def sample_ctco_params(trial: optuna.Trial, n_actions: int, n_envs: int, additio
         {
             "n_rbf": trial.suggest_int("n_rbf", 1, 5),
             "d_max": trial.suggest_float("d_max", 0.1, 2.0, log=True),
-            "high_freq_penalty": trial.suggest_float("high_freq_penalty", 1e-4, 0.1, log=True),
+            "relative_penalty": trial.suggest_float("relative_penalty", 0.01, 3.0, log=True),
             "ent_coef_start": trial.suggest_float("ent_coef_start", 0.005, 1.0, log=True),
             "learning_rate": trial.suggest_float("learning_rate", 1e-4, 3e-3, log=True),
             "updates_per_second": trial.suggest_float("updates_per_second", 5.0, 60.0, log=True),

@@ -56,7 +56,7 @@ def test_deviations_are_those_of_the_code():
         "join",
         "d_min",
     }
-    assert defaults["high_freq_penalty"] == 0.003
+    assert defaults["high_freq_penalty"] == "relative_0.1"
     assert f"clamped to [−{-LOG_STD_MIN:.0f}, {LOG_STD_MAX:.0f}]" in TEXT
 
 

@@ -224,7 +224,7 @@ def test_schedules_count_primitive_steps(random_walk_env):
 
 
 def test_logs(random_walk_env):
-    model = make(random_walk_env(), learning_starts=20, gradient_steps=1, d_min=0.3)
+    model = make(random_walk_env(), learning_starts=20, gradient_steps=1, d_min=0.3, high_freq_penalty=0.003)
     logged = {}
 
     class Spy(BaseCallback):

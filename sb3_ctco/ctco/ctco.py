@@ -154,7 +154,7 @@ class CTCO(SoftOptionActorCritic):
         trajectory: str | type[Trajectory] = "bezier",
         duration_scale: DurationScale = "log",
         join: Join = "free",
-        high_freq_penalty: float | str | Schedule = 0.003,
+        high_freq_penalty: float | str | Schedule = "relative_0.1",
         target_decision_rate: float | None = None,
         ent_coef: str | float = "auto_0.02",
         target_entropy: str | float | Schedule = "auto",
