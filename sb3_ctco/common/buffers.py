@@ -269,7 +269,7 @@ class _OptionStorage(ReplayBuffer):
 
     @property
     def mean_reward_rate(self) -> float:
-        """What options pay a second: mean of |R| by mean duration, of all so far that paid anything; 1 before the first."""
+        """What options pay a second: mean of abs(R) by mean duration, of all so far that paid anything; 1 before the first."""
         return self._paid / self._paid_seconds if self._paid_seconds else 1.0
 
     def _count_paid(self, integrated_rewards: np.ndarray, durations: np.ndarray) -> None:
