@@ -44,7 +44,14 @@ def test_a_model_of_0_1_0_acts_as_it_did_and_learns_on(algorithm):
 def test_a_replay_buffer_of_0_1_0_is_learned_from():
     model = CTCO.load(DATA / "ctco-0.1.0.zip", env=gym.make("Pendulum-v1"), device="cpu")
     model.load_replay_buffer(DATA / "ctco-0.1.0-buffer.pkl")
-    assert model.replay_buffer.size() == 154
+    buffer = model.replay_buffer
+    assert buffer.size() == 154
+    # What was paid is counted from its rows, and so a unit is found before anything is added.
+    rate = np.abs(buffer.integrated_rewards[:154]).sum() / buffer.durations[:154].sum()
+    assert buffer.mean_reward_rate == pytest.approx(rate)
+    buffer.reward_scale = "auto"
+    assert buffer.found_reward_scale() != 1.0
+    buffer.reward_scale = 1.0
     model.learn(60, reset_num_timesteps=False)
     samples = model.replay_buffer.sample(8)
     assert samples.rewards.shape == samples.discounts.shape == (8, 1)

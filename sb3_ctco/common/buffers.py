@@ -51,8 +51,6 @@ class _OptionStorage(ReplayBuffer):
     n_demonstrations = 0
     option_space: OptionSpace | None = None
     primitive_action_space: spaces.Box | None = None
-    _paid = 0.0
-    _paid_seconds = 0.0
 
     def __init__(
         self,
@@ -100,6 +98,13 @@ class _OptionStorage(ReplayBuffer):
         #: How many decisions were ever added (without sub-options), and how long their options took, in s.
         self.n_decisions = 0
         self.decision_seconds = 0.0
+        self._paid = self._paid_seconds = 0.0
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        vars(self).update(state)
+        if "_paid" not in state:  # saved without; rows that nothing was written to count nothing
+            self._paid = self._paid_seconds = 0.0
+            self._count_paid(self.integrated_rewards, self.durations)
 
     @property
     def bytes_per_transition(self) -> int:
@@ -269,7 +274,7 @@ class _OptionStorage(ReplayBuffer):
 
     @property
     def mean_reward_rate(self) -> float:
-        """What options pay a second: mean of abs(R) by mean duration, of all so far that paid anything; 1 before the first."""
+        """Mean abs(R) by mean duration, of all options so far that paid anything, in the unit of rewards; 1 before the first."""
         return self._paid / self._paid_seconds if self._paid_seconds else 1.0
 
     def _count_paid(self, integrated_rewards: np.ndarray, durations: np.ndarray) -> None:
