@@ -274,7 +274,7 @@ class _OptionStorage(ReplayBuffer):
 
     @property
     def mean_reward_rate(self) -> float:
-        """Mean abs(R) by mean duration, of all options so far that paid anything, in the unit of rewards; 1 before the first."""
+        """Mean abs(R) by mean duration, of all options so far that paid anything, in the unit of rewards; 1 before any."""
         return self._paid / self._paid_seconds if self._paid_seconds else 1.0
 
     def _count_paid(self, integrated_rewards: np.ndarray, durations: np.ndarray) -> None:
