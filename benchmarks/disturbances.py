@@ -1,7 +1,7 @@
 """Trained policies that are pushed, or see nothing new for a while: options whole, replanned, or ended by the critics.
 
-    sb3-ctco study run --preset quick --rates 500 --settings tuned --tasks cheetah ball_in_cup --seeds 0 1 2
-    python benchmarks/disturbances.py runs/study/quick
+    sb3-ctco study run --preset benchmarks/joins.yml --rates 500 --settings tuned --tasks cheetah ball_in_cup
+    python benchmarks/disturbances.py runs/study/joins
 
 Every model of CTCO with this setting in a study's folder plays greedily,
 

@@ -68,7 +68,7 @@ def main() -> None:
         tau=0.01,
         updates_per_second=20,
         d_max=0.5,
-        # More random than by default, −dim(ω): a sparse reward must be found before anything can be learned.
+        # More random than by default, −dim(ω) − 1: a sparse reward must be found before anything can be learned.
         target_entropy=0.0,
         buffer_size=200_000,
         policy_kwargs={"net_arch": {"pi": [64, 64], "qf": [128, 128]}},

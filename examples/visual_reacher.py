@@ -30,7 +30,7 @@ def make_model(env: gym.Env, rate: int, seed: int, **kwargs: Any) -> CTCO:
         env,
         learning_rate=1e-3,
         learning_starts=60 * rate,
-        buffer_size=100_000,
+        buffer_size=120_000,
         batch_size=32,
         tau=0.01,
         # From SAC's usual start, 1, a reward of 1 a second would be outweighed by entropy for most of a run.

@@ -179,7 +179,8 @@ def sac_at_rate(
         (0.98, 4, 1, 1200)
 
     :param env: the environment to learn from: a Gymnasium id, a bare environment, one in a ``RewardRateWrapper``, or a
-        VecEnv of such
+        VecEnv of such (not with ``hold_seconds``). A ``RewardRateWrapper`` of yours has the unit that its ``reward_scale``
+        says; that of a bare environment is given 1/``step_weight(gamma_dt, discount_rate)``
     :param dt: the environment's interaction period, in s
     :param updates_per_second: updates per second of task time, summed over the environments of a VecEnv
     :param gamma: discount factor over ``gamma_dt`` seconds, in (0, 1]
@@ -277,7 +278,8 @@ def _with_reward_rate(env: GymEnv, dt: float, discount_rate: float, reward_scale
         if not all(env.env_is_wrapped(RewardRateWrapper)):
             raise ValueError(
                 "sac_at_rate cannot wrap the environments of a VecEnv from outside: make it with "
-                "make_vec_env(..., wrapper_class=RewardRateWrapper, wrapper_kwargs=dict(dt=..., discount_rate=...))"
+                f"make_vec_env(..., wrapper_class=RewardRateWrapper, wrapper_kwargs=dict(dt={dt}, "
+                f"discount_rate={discount_rate:.6g}, reward_scale={reward_scale:.6g}))"
             )
         settings: list[OptionSpace] = env.get_attr("option_space")
     elif (wrapped := unwrap_wrapper(env, RewardRateWrapper)) is not None:

@@ -75,13 +75,13 @@ class OptionExecutionWrapper(gym.Wrapper, RecordConstructorArgs):
     :param d_max: longest duration, in s; by default a fifth of the horizon 1/τ, 0.5 s at most, see
         :func:`~sb3_ctco.options.default_durations`
     :param d_min: shortest duration, in s; 0 for one step (``dt``), which an option takes in any case; by default a hundredth
-        of the horizon, or a step if that is longer
+        of the horizon and 0.025 s at most, or a step if that is longer
     :param dt: the interaction period, in s; by default what :func:`find_dt` finds
     :param discount_rate: τ, in 1/s; by default the paper's 0.404 (a factor of 0.98 over 0.05 s)
     :param reward: what ``step`` returns as reward: ``"sum"`` of the primitive rewards, which makes returns comparable
         with an agent of fixed rate, or ``"integral"``, R, for use under an algorithm that knows nothing of options
     :param reward_unit: ``"rate"`` if rewards do not shrink with dt, ``"impulse"`` if they are paid per event
-    :param n_sub_options: how many random stretches of each option to hand over as options of their own, in
+    :param n_sub_options: how many random stretches of each option, at most, to hand over as options of their own, in
         ``info["sub_options"]`` (:class:`~sb3_ctco.options.SubOptions`), for a replay buffer that learns from them
     :param sub_option_tolerance: leave out a sub-option if its actions deviate by more from those that were played;
         actions count as normalised to [−1, 1]
@@ -139,7 +139,8 @@ class OptionExecutionWrapper(gym.Wrapper, RecordConstructorArgs):
         if not (np.isfinite(space.low).all() and np.isfinite(space.high).all()):
             raise ValueError(
                 f"OptionExecutionWrapper needs finite action bounds, not {space}: "
-                "wrap the environment with gymnasium.wrappers.ClipAction or RescaleAction, or give its space bounds"
+                "wrap the environment with gymnasium.wrappers.TransformAction(env, lambda action: action, Box(low, high)), "
+                "or give its space bounds"
             )
         if reward not in ("sum", "integral"):
             raise ValueError(f"reward must be 'sum' or 'integral', not {reward!r}")

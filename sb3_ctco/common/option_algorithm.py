@@ -74,8 +74,8 @@ class OptionOffPolicyAlgorithm(OffPolicyAlgorithm):
     :param gradient_steps: updates per training; -1 for as many as primitive steps were collected
     :param updates_per_second: updates per second of task time, the paper's "fixed number of updates per time unit",
         in place of ``gradient_steps``; a fraction is carried over
-    :param n_sub_options: how many random stretches of each option go into the replay buffer beside it; environments that
-        are wrapped already are told
+    :param n_sub_options: how many random stretches of each option, at most, go into the replay buffer beside it;
+        environments that are wrapped already are told
     :raises ValueError: for settings out of range or contradicting each other or the environment's
     """
 

@@ -55,13 +55,13 @@ class CTCO(SoftOptionActorCritic):
     Paper: Karimi, Jin, Luo, Mahmood, Jagersand, Tosatto: "Dynamic Decision Frequency with Continuous Options",
     IROS 2023, https://arxiv.org/abs/2212.04407
 
-    Where it differs from the paper, the paper's way is an argument away: entropy counts relative to the uniform
-    distribution (``entropy_reference="paper"``), two critics (``policy_kwargs=dict(n_critics=1)``), temperatures
-    for ω and d, learned (pass a number for the paper's β_E), ω squashed by tanh so that actions stay in their bounds, and
-    a shortest duration that follows from the discount (``d_min=0`` is one step, as the paper's durations are in (0, d_max)).
-
-    Settings that the paper's algorithm would have are in :meth:`paper_defaults`; the class's own were measured to learn
-    faster on the paper's tasks.
+    Where it differs from the paper, the paper's way is an argument away, and :meth:`paper_defaults` has all of them: Bézier
+    curves (``trajectory="rbf"``), durations on a logarithmic scale (``duration_scale="linear"``) from a shortest one that
+    follows from the discount (``d_min=0`` is one step), sub-options (``n_sub_options=0``), a relative β_h
+    (``high_freq_penalty=0.05``), entropy relative to the uniform distribution (``entropy_reference="paper"``, with linear
+    durations), learned temperatures (``ent_coef`` as a number, the paper's β_E) and two critics
+    (``policy_kwargs=dict(n_critics=1)``). One thing has no argument: ω is squashed by tanh, so that actions stay in their
+    bounds. The class's own settings were measured to learn faster on the paper's tasks.
 
     Steps are primitive environment steps everywhere.
 
@@ -78,7 +78,7 @@ class CTCO(SoftOptionActorCritic):
     :param train_freq: collect at least this many steps between trainings, or ``(n, "episode")``
     :param gradient_steps: updates per training; -1 for one a step; 1 (with ``train_freq=1``) for the paper's Algorithm 1
     :param updates_per_second: updates per second of task time, in place of ``gradient_steps``
-    :param n_sub_options: how many random stretches of each option that was played go into the replay buffer beside it,
+    :param n_sub_options: how many random stretches of each option that was played, at most, go into the replay buffer with it,
         as options of their own, which counts in ``buffer_size``; 0 is the paper's way
     :param n_rbf: number of weights an action dimension
     :param d_max: longest duration of an option, in s; by default a fifth of the horizon 1/τ, and 0.5 s at most
@@ -94,8 +94,8 @@ class CTCO(SoftOptionActorCritic):
         is being sent then (``"continuous"``), or there and at the slope at which actions were changing (``"smooth"``), see
         :class:`~sb3_ctco.wrappers.OptionExecutionWrapper`
     :param high_freq_penalty: β_h, subtracted once a decision in the critic's target: a number, or a function of the remaining
-        progress, in the unit of R times the buffer's ``reward_scale``; or ``"relative_0.1"`` for a tenth of what is paid in
-        ``d_min`` on average, by all options so far that paid anything, which depends on no unit
+        progress, in the unit of R times the buffer's ``reward_scale``; or ``"relative_0.1"`` for a tenth of the absolute
+        reward that is paid in ``d_min`` on average, by all options so far that paid anything, which depends on no unit
     :param target_decision_rate: in Hz, in place of a fixed β_h: ``high_freq_penalty`` is where β_h starts, and it rises
         while the policy decides more often than this, and falls while it decides less often
     :param ent_coef: temperature, a number, in the unit of β_h; ``"auto"`` to learn one for each of the ``n_rbf`` weights of a
