@@ -20,7 +20,7 @@ from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv, VecEnvWrapper
 SelfAlgorithm = TypeVar("SelfAlgorithm", bound=BaseAlgorithm)
 
 #: Attributes that Stable-Baselines3 saves, but that setting up a loaded model begins anew
-_BEGUN_ANEW = ("_last_options", "_counted_decisions")
+_BEGUN_ANEW = ("_last_options",)
 #: Attributes of VecEnvs that belong to where they are in, not to what they have seen
 _NOT_STATE = ("venv", "class_attributes")
 

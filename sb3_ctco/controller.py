@@ -176,7 +176,7 @@ class OptionController:
         interrupt: ValueInterrupt | None = None,
         safety: Safety | None = Safety(),  # noqa: B008 (frozen)
     ):
-        if not (replan_period is None or replan_period > 0):
+        if not (replan_period is None or 0 < replan_period < math.inf):
             raise ValueError(f"replan_period must be a positive number of seconds or None, not {replan_period}")
         if not (interrupt is None or isinstance(interrupt, ValueInterrupt)):
             raise TypeError(

@@ -122,12 +122,12 @@ class _EpisodeTracker:
     def __post_init__(self) -> None:
         self.running = [EpisodeStatistics() for _ in range(self.n_envs)]
 
-    def step(self, rewards: np.ndarray, dones: np.ndarray, infos: list[dict[str, Any]]) -> list[EpisodeStatistics]:
+    def step(self, rewards: np.ndarray, dones: np.ndarray, infos: list[dict[str, Any]]) -> dict[int, EpisodeStatistics]:
         """Account for one step of each environment.
 
-        :return: the episodes that ended with it
+        :return: the episodes that ended with it, by environment
         """
-        ended = []
+        ended = {}
         for i, (reward, done, info) in enumerate(zip(rewards, dones, infos, strict=True)):
             if PENDING in info:
                 continue
@@ -145,7 +145,7 @@ class _EpisodeTracker:
             if done:
                 if "episode" in info:
                     episode.episode_return = info["episode"]["r"]
-                ended.append(episode)
+                ended[i] = episode
                 self.running[i] = EpisodeStatistics()
         return ended
 
@@ -159,18 +159,18 @@ class _ActionRecorder:
 
     def __post_init__(self) -> None:
         self.actions = [[] for _ in range(self.env.num_envs)]
-        self.is_option_env = self.env.has_attr("option_space")
+        self.is_option_env = self.env.has_attr("primitive_action_space")
         space = self.env.get_attr("primitive_action_space")[0] if self.is_option_env else self.env.action_space
         if not (isinstance(space, spaces.Box) and np.isfinite(space.low).all() and np.isfinite(space.high).all()):
             raise ValueError(f"smoothness is measured of actions in a Box with finite bounds, not in {space}")
         self.low, self.range = space.low.astype(np.float64), space.high.astype(np.float64) - space.low
 
-    def step(self, actions: np.ndarray, dones: np.ndarray, infos: list[dict[str, Any]]) -> list[np.ndarray]:
+    def step(self, actions: np.ndarray, dones: np.ndarray, infos: list[dict[str, Any]]) -> dict[int, np.ndarray]:
         """Account for one step of each environment.
 
-        :return: the normalised actions of the episodes that ended with it, each ``[n_steps, action_dim]``
+        :return: the normalised actions of the episodes that ended with it, by environment, each ``[n_steps, action_dim]``
         """
-        ended = []
+        ended = {}
         for i, (action, done, info) in enumerate(zip(actions, dones, infos, strict=True)):
             if PENDING in info:
                 continue
@@ -178,7 +178,7 @@ class _ActionRecorder:
             self.actions[i].append(2.0 * (played - self.low) / self.range - 1.0)
             if done:
                 episode = np.concatenate(self.actions[i])
-                ended.append(episode.reshape(len(episode), -1))
+                ended[i] = episode.reshape(len(episode), -1)
                 self.actions[i] = []
         return ended
 
@@ -196,7 +196,7 @@ def evaluate_discounted_return(
 
     :param model: anything with Stable-Baselines3's ``predict``
     :param env: the environment that the model acts in: for CTCO one wrapped in ``OptionExecutionWrapper``
-    :param n_eval_episodes: number of episodes
+    :param n_eval_episodes: number of episodes, shared among the environments of a VecEnv
     :param deterministic: whether to act greedily
     :param discount_rate: τ, in 1/s; by default the environment's where steps are options, and the paper's 0.404 elsewhere
     :param dt: interaction period in s, needed where steps are no options
@@ -215,17 +215,23 @@ def evaluate_discounted_return(
     # Of policies with a memory, such as DAC-PPO's current option
     state: tuple[np.ndarray, ...] | None = None
     dones = np.ones(env.num_envs, dtype=bool)
-    while len(episodes) < n_eval_episodes:
+    # As many of each environment, as Stable-Baselines3's evaluate_policy has: those that end first are the short ones.
+    wanted = [(n_eval_episodes + i) // env.num_envs for i in range(env.num_envs)]
+    while any(wanted):
         actions, state = model.predict(obs, state=state, episode_start=dones, deterministic=deterministic)  # type: ignore[arg-type]
         obs, rewards, dones, infos = env.step(actions)
         ended = tracker.step(rewards, dones, infos)
         if recorder is not None:
-            for episode, played in zip(ended, recorder.step(actions, dones, infos), strict=True):
+            for i, played in recorder.step(actions, dones, infos).items():
+                episode = ended[i]
                 episode.mean_absolute_jerk = mean_absolute_jerk(played, episode.seconds / len(played))
                 episode.spectral_smoothness = spectral_smoothness(played)
                 episode.largest_jump = largest_jump(played)
-        episodes += ended
-    return episodes[:n_eval_episodes]
+        for i, episode in ended.items():
+            if wanted[i]:
+                wanted[i] -= 1
+                episodes.append(episode)
+    return episodes
 
 
 class DiscountedReturnCallback(BaseCallback):
@@ -255,7 +261,7 @@ class DiscountedReturnCallback(BaseCallback):
         if infos[0]:  # empty at the ticks between two decisions
             ended = self._tracker.step(self.locals["rewards"], self.locals["dones"], infos)
             if ended:
-                self.episodes += ended
+                self.episodes += ended.values()
                 self.timesteps += [self.num_timesteps] * len(ended)
                 recent = [episode.discounted_return for episode in self.episodes[-100:]]
                 self.logger.record("rollout/ep_discounted_return_mean", float(np.mean(recent)))

@@ -12,9 +12,12 @@ from stable_baselines3.common.base_class import maybe_make_env
 from stable_baselines3.common.callbacks import BaseCallback, CallbackList
 from stable_baselines3.common.env_util import unwrap_wrapper
 from stable_baselines3.common.monitor import Monitor
+from stable_baselines3.common.preprocessing import is_image_space
+from stable_baselines3.common.torch_layers import FlattenExtractor
 from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback
 from stable_baselines3.common.vec_env import VecEnv
 from stable_baselines3.sac.policies import LOG_STD_MAX, LOG_STD_MIN, SACPolicy
+from torch import nn
 
 from sb3_ctco.common.buffers import OptionReplayBuffer
 from sb3_ctco.common.callbacks import OptionProgressBarCallback, PrimitiveStepCallback
@@ -58,11 +61,12 @@ class QuickSACPolicy(SACPolicy):
     def __init__(self, *args: Any, **kwargs: Any):
         kwargs["optimizer_kwargs"] = {"fused": True, **(kwargs.get("optimizer_kwargs") or {})}
         super().__init__(*args, **kwargs)
-        activation, extractor = self.activation_fn.__name__, type(self.actor.features_extractor).__name__
-        if self.actor.use_sde or (activation, extractor) != ("ReLU", "FlattenExtractor"):
+        space, activation, extractor = self.observation_space, self.activation_fn, type(self.actor.features_extractor)
+        is_vector = isinstance(space, spaces.Box) and not is_image_space(space) and extractor is FlattenExtractor
+        if self.actor.use_sde or activation is not nn.ReLU or not is_vector:
             raise ValueError(
-                "QuickSACPolicy is for vectors, ReLU and no gSDE, not for "
-                f"{extractor}, {activation} and use_sde={self.actor.use_sde}: use SACPolicy"
+                f"QuickSACPolicy is for vectors, ReLU and no gSDE, not for {extractor.__name__} of {space}, "
+                f"{activation.__name__} and use_sde={self.actor.use_sde}: use SACPolicy"
             )
 
     def set_training_mode(self, mode: bool) -> None:
@@ -199,7 +203,7 @@ def sac_at_rate(
     :return: a ``stable_baselines3.SAC``
     :raises ValueError: for settings out of range, or that contradict the environment's
     :raises TypeError: if ``kwargs`` have what follows from the clock: ``train_freq``, ``gradient_steps`` or
-        ``learning_starts``
+        ``learning_starts``, or with ``hold_seconds`` a ``replay_buffer_class``
     """
     for name in ("train_freq", "gradient_steps", "learning_starts"):
         if name in kwargs:
@@ -237,9 +241,7 @@ def sac_at_rate(
         model = SAC(policy, env, train_freq=train_freq, gradient_steps=gradient_steps, **clock, **kwargs)
     else:
         # The buffer has the discount of each decision, so gamma is not used.
-        price = decision_price * reward_scale
-        buffer = {"discount_rate": discount_rate, "reward_scale": reward_scale, "decision_price": price}
-        kwargs |= {"replay_buffer_class": _PricedReplayBuffer, "replay_buffer_kwargs": buffer}
+        kwargs |= _priced_buffer(kwargs, env, discount_rate, reward_scale, decision_price)
         env = hold_actions(env, hold_seconds, n_rbf, learned_duration, dt, discount_rate)
         model = _SACOnOptions(policy, env, **clock, **kwargs)
         model.updates_per_step = updates_per_second * dt
@@ -262,6 +264,29 @@ def hold_actions(
     shortest = dt if learned_duration else hold_seconds
     options = OptionExecutionWrapper(env, n_rbf, hold_seconds, shortest, dt, discount_rate, duration_scale="linear")
     return options if learned_duration else FixedDurationWrapper(options)
+
+
+def _priced_buffer(
+    given: dict[str, Any], env: GymEnv, discount_rate: float, reward_scale: float, decision_price: float
+) -> dict[str, Any]:
+    """SAC's arguments for its replay buffer, of which users may have given some."""
+    if given.get("replay_buffer_class") is not None:
+        raise TypeError(
+            "with hold_seconds sac_at_rate sets replay_buffer_class itself, not to "
+            f"{given['replay_buffer_class'].__name__}: leave it out"
+        )
+    if isinstance(env.observation_space, spaces.Dict):
+        raise ValueError(
+            f"hold_seconds is for observations in one array, not in {env.observation_space}: flatten them with "
+            "gymnasium.wrappers.FlattenObservation"
+        )
+    kwargs = {
+        **(given.get("replay_buffer_kwargs") or {}),
+        "discount_rate": discount_rate,
+        "reward_scale": reward_scale,
+        "decision_price": decision_price * reward_scale,
+    }
+    return {"replay_buffer_class": _PricedReplayBuffer, "replay_buffer_kwargs": kwargs}
 
 
 def _explore_with_pink_noise(model: SAC, n_decisions: int) -> None:

@@ -93,6 +93,10 @@ def find_task(name: str) -> Task:
     return Task(name, name, name, any_rate=False, episode_seconds=None)
 
 
+#: Parameters of constructors that follow from a run's place in the grid, or are the same for all runs
+_SAID_BY_THE_STUDY = {"env", "make_env", "dt", "discount_rate", "seed", "device", "_init_setup_model"}
+
+
 @dataclass(frozen=True)
 class Algorithm:
     """An algorithm as a study makes it.
@@ -104,7 +108,7 @@ class Algorithm:
     :param name: in presets, records and RL Zoo
     :param label: in figures and tables
     :param colour: its lines', one of matplotlib's
-    :param constructors: whose parameters may be arguments in a preset
+    :param constructors: whose parameters may be arguments in a preset, but for those that the study says itself
     :param in_steps: turns arguments in seconds into steps: ``in_steps(arguments, dt, episode_seconds)``
     :param zoo_class: the class that RL Zoo trains; None for one that it has itself
     """
@@ -128,8 +132,8 @@ class Algorithm:
         :raises ValueError: if one is unknown, or ``gamma``, ``gamma_dt`` or ``updates_per_second`` is missing
         """
         arguments = self.in_steps(dict(given), dt, episode_seconds)
-        known = {name for constructor in self.constructors for name in inspect.signature(constructor).parameters} | {"n_envs"}
-        unknown = sorted(set(arguments) - known)
+        known = {name for constructor in self.constructors for name in inspect.signature(constructor).parameters}
+        unknown = sorted(set(arguments) - known | set(arguments) & _SAID_BY_THE_STUDY)
         if unknown:
             raise ValueError(f"{where} has no arguments {unknown}")
         missing = [name for name in ("gamma", "gamma_dt", "updates_per_second") if name not in arguments]
@@ -228,7 +232,7 @@ ALGORITHMS: dict[str, Algorithm] = {
             "dac_ppo",
             "DAC-PPO",
             "C3",
-            constructors=(DACPPO,),
+            constructors=(DACPPO, _with_reward_rate),
             make=_make_dac_ppo,
             make_eval_env=_make_dac_ppo_eval_env,
             in_steps=_rollouts_in_steps,

@@ -13,16 +13,17 @@ from stable_baselines3.common.vec_env.subproc_vec_env import _stack_obs
 from sb3_ctco.options import PLAYED
 
 #: Key of the infos of environments whose option runs on
-PENDING = "pending"
+PENDING = "option_pending"
 
 
 class AsyncOptionVecEnv(SubprocVecEnv):
     """Stable-Baselines3's ``SubprocVecEnv`` for options of different durations: nobody waits for the slowest.
 
     ``step`` returns as soon as ``min_ready`` options have ended. Environments whose option runs on are marked by
-    ``info["pending"]``: their observation is the one that the option began with, their reward is 0, and the action that
-    they are given next is ignored. Where an option ended, ``info["played"]`` is the action that began it, perhaps several
-    calls before. CTCO and FiGAR-SAC learn from the options that ended; environments run on while the networks are updated.
+    ``info["option_pending"]``: their observation is the one that the option began with, their reward is 0, and the action that
+    they are given next is ignored. Where an option ended, ``info["option_played"]`` is the action that began it, perhaps
+    several calls before. CTCO and FiGAR-SAC learn from the options that ended; environments run on while the networks
+    are updated.
 
     Which option ends first depends on timing, so that runs cannot be repeated exactly. Other algorithms, and wrappers of
     VecEnvs that keep statistics or stacks of observations, would count pending observations again.

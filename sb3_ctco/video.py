@@ -8,6 +8,7 @@ import gymnasium as gym
 from gymnasium.utils import RecordConstructorArgs
 
 from sb3_ctco.wrappers import find_dt
+from sb3_ctco.wrappers.checks import reset_env
 
 
 class RecordEpisodes(gym.Wrapper, RecordConstructorArgs):
@@ -58,7 +59,7 @@ class RecordEpisodes(gym.Wrapper, RecordConstructorArgs):
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
         """Begin an episode and its video."""
         self._write()
-        result = self.env.reset(seed=seed, options=options)
+        result = reset_env(self.env, seed, options)
         self._n_steps = 0
         if self.progress:
             from tqdm import tqdm  # noqa: PLC0415

@@ -218,7 +218,15 @@ def test_what_options_pay_a_second(kind):
     assert buffer.mean_reward_rate == 1.0  # Nothing was paid.
     add(buffer, kind, 1, [option_info(1.0, 3.0)])
     add(buffer, kind, 2, [option_info(2.0, -4.5)])
-    assert buffer.mean_reward_rate == 7.5 / 3.0  # what is lost counts, too; what pays nothing does not
+    # What is lost counts, too; what pays nothing does not; what was paid earlier fades over 100 horizons.
+    kept = np.exp(-2.0 * buffer.discount_rate / 100.0)
+    assert buffer.mean_reward_rate == pytest.approx((3.0 * kept + 4.5) / (kept + 2.0), rel=1e-12)
+    assert 2.4 < buffer.mean_reward_rate < 2.5
+    for _ in range(10):
+        add(buffer, kind, 3, [option_info(100.0, 100.0)])
+    # The first 3 s, of 2.5 a second, weigh a fiftieth of the rest.
+    weight = np.exp(-1000.0 * buffer.discount_rate / 100.0)
+    assert buffer.mean_reward_rate == pytest.approx(1.0, abs=1.5 * 3.0 * weight / 100.0)
 
 
 @pytest.mark.parametrize("kind", ["vector", "dict"])

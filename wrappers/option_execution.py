@@ -18,6 +18,7 @@ from sb3_ctco.options import (
     DEFAULT_DISCOUNT_RATE,
     LAST_ACTION,
     REWARD_UNITS,
+    TAKEN_OVER,
     ActionBox,
     DurationScale,
     Join,
@@ -92,7 +93,7 @@ class OptionExecutionWrapper(gym.Wrapper, RecordConstructorArgs):
         of the observation (:mod:`sb3_ctco.options.joins`); an episode begins with the middle of the box, at rest. Where the
         environment's info has a ``"last_action"``, after ``reset`` or after a step in which something else was sent than it
         was given, that is taken, in the environment's units
-    :raises TypeError: if the action space is not a ``Box``
+    :raises TypeError: if the action space is not a ``Box`` of real numbers
     :raises ValueError: if its bounds are not finite, a setting is out of range, or dt is not given and not found
     """
 
@@ -136,11 +137,16 @@ class OptionExecutionWrapper(gym.Wrapper, RecordConstructorArgs):
             raise TypeError(
                 f"OptionExecutionWrapper needs a Box action space, not {space}: options are trajectories of continuous actions"
             )
+        if not np.issubdtype(space.dtype, np.floating):
+            raise TypeError(
+                f"OptionExecutionWrapper needs actions that are real numbers, not {space}: options are trajectories of "
+                "continuous actions, which whole numbers would round to zero"
+            )
         if not (np.isfinite(space.low).all() and np.isfinite(space.high).all()):
             raise ValueError(
                 f"OptionExecutionWrapper needs finite action bounds, not {space}: "
-                "wrap the environment with gymnasium.wrappers.TransformAction(env, lambda action: action, Box(low, high)), "
-                "or give its space bounds"
+                "wrap the environment with gymnasium.wrappers.TransformAction(env, lambda action: action, "
+                "Box(low, high)), or give its space bounds"
             )
         if reward not in ("sum", "integral"):
             raise ValueError(f"reward must be 'sum' or 'integral', not {reward!r}")
@@ -280,10 +286,10 @@ class OptionExecutionWrapper(gym.Wrapper, RecordConstructorArgs):
     def set_n_sub_options(self, n_sub_options: int) -> None:
         """How many sub-options to hand over from now on; after a change the environment must be reset.
 
-        :raises ValueError: if it is negative
+        :raises ValueError: if it is negative, or not a whole number
         """
-        if n_sub_options < 0:
-            raise ValueError(f"n_sub_options must be at least 0, not {n_sub_options}")
+        if isinstance(n_sub_options, bool) or not isinstance(n_sub_options, int | np.integer) or n_sub_options < 0:
+            raise ValueError(f"n_sub_options must be a whole number of at least 0, not {n_sub_options}")
         if n_sub_options != self.n_sub_options:
             self.n_sub_options = n_sub_options
             self._play = None
@@ -339,9 +345,11 @@ class OptionExecutionWrapper(gym.Wrapper, RecordConstructorArgs):
                 rewards.append(reward)  # type: ignore[arg-type]
                 if joined and LAST_ACTION in info:
                     sent[len(rewards) - 1] = info[LAST_ACTION]
-                if terminated or truncated:
+                # What was sent in place of an action ends its option, as the end of an episode does.
+                ended = terminated or truncated or info.get(TAKEN_OVER)
+                if ended:
                     break
-            if terminated or truncated:
+            if ended:
                 break
             if last < len(actions):
                 on_the_way.append(deepcopy(obs))

@@ -46,8 +46,8 @@ class RealTimeOptionWrapper(OptionExecutionWrapper):
 
     With ``interrupt``, a function that is called after each primitive step, an option ends as soon as it says so; or as soon
     as a :class:`~sb3_ctco.options.ValueInterrupt` does, which is asked every ``check_period`` and told the rest of the plan.
-    The transition has the time that ran, and ``info["played"]`` is the option that plays what was played, as which CTCO stores
-    it (not with ``decide_ahead``, where a transition consists of parts of two options). ``info["interrupted"]`` of the
+    The transition has the time that ran, and ``info["option_played"]`` is the option that plays what was played, as which CTCO
+    stores it (not with ``decide_ahead``, where a transition consists of parts of two options). ``info["interrupted"]`` of the
     environment inside ends it as well.
 
     An option that is not finite, of a policy that has diverged, is no error where commands are guarded

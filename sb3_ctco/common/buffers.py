@@ -127,13 +127,13 @@ class _OptionStorage(ReplayBuffer):
 
         :param infos: each with ``info["option"]`` of :class:`~sb3_ctco.wrappers.OptionExecutionWrapper`, and
             ``info["sub_options"]`` if it hands over any; nothing is stored of environments whose option runs on
-            (``info["pending"]`` of :class:`~sb3_ctco.vec_env.AsyncOptionVecEnv`), or where something else was sent than the
-            policy's actions (``info["taken_over"]``, of a guard or of :class:`~sb3_ctco.wrappers.TakeOverWrapper`)
+            (``info["option_pending"]`` of :class:`~sb3_ctco.vec_env.AsyncOptionVecEnv`), or where something else was sent
+            than the policy's actions (``info["taken_over"]``, of a guard or of :class:`~sb3_ctco.wrappers.TakeOverWrapper`)
         :raises ValueError: if that is missing, not finite, or was discounted at another rate, or if sub-options saw other
             observations than these; nothing is stored then
         """
         try:
-            options = {i: info["option"] for i, info in enumerate(infos) if PENDING not in info and TAKEN_OVER not in info}
+            options = {i: info["option"] for i, info in enumerate(infos) if PENDING not in info and not info.get(TAKEN_OVER)}
         except KeyError:
             raise ValueError(
                 f"{type(self).__name__} needs info['option']: wrap the environment with "
@@ -274,12 +274,18 @@ class _OptionStorage(ReplayBuffer):
 
     @property
     def mean_reward_rate(self) -> float:
-        """Mean abs(R) by mean duration, of all options so far that paid anything, in the unit of rewards; 1 before any."""
+        """Mean abs(R) by mean duration, of the last decisions that paid anything, in the unit of rewards; 1 before any.
+
+        What was paid fades over 100 horizons 1/τ of such decisions, 250 s with the paper's discount.
+        """
         return self._paid / self._paid_seconds if self._paid_seconds else 1.0
 
     def _count_paid(self, integrated_rewards: np.ndarray, durations: np.ndarray) -> None:
-        self._paid += float(np.abs(integrated_rewards).sum())
-        self._paid_seconds += float(np.sum(durations[integrated_rewards != 0]))
+        seconds = float(np.sum(durations[integrated_rewards != 0]))
+        # Without a discount, a horizon is 100 s.
+        kept = math.exp(-seconds * max(self.discount_rate, 0.01) / 100.0)
+        self._paid = kept * self._paid + float(np.abs(integrated_rewards).sum())
+        self._paid_seconds = kept * self._paid_seconds + seconds
 
     @property
     def _n_experienced(self) -> int:
@@ -330,9 +336,9 @@ class _OptionStorage(ReplayBuffer):
         # What primitive steps paid in sum is not kept of a sub-option; samples have R.
         self.rewards[rows, 0] = self.integrated_rewards[rows, 0] = sub_options.integrated_rewards
         self.durations[rows, 0] = sub_options.durations
-        self._count_paid(sub_options.integrated_rewards, sub_options.durations)
         self.dones[rows, 0] = sub_options.terminated | sub_options.truncated
-        self.timeouts[rows, 0] = sub_options.truncated & self.handle_timeout_termination
+        # Both flags are set where the last step that is allowed ends the episode: that is an end.
+        self.timeouts[rows, 0] = sub_options.truncated & ~sub_options.terminated & self.handle_timeout_termination
 
     def _sample_fields(self, batch_inds: np.ndarray, env: VecNormalize | None) -> dict[str, Any]:
         # ReplayBuffer._get_samples of Stable-Baselines3 2.9 has no place for further fields, so it is written anew.
@@ -360,9 +366,9 @@ class _OptionStorage(ReplayBuffer):
         """What R is multiplied by in samples; ``"auto"`` is found now, if anything was paid yet, and 1 until then."""
         if self.reward_scale != "auto":
             return self.reward_scale
-        if not self._paid:
-            return 1.0  # To nothing every scale is the same.
         paid = self.integrated_rewards != 0
+        if not paid.any():
+            return 1.0  # To nothing every scale is the same.
         # Without a discount, forever is 100 s.
         forever = np.abs(self.integrated_rewards[paid]) / -np.expm1(-max(self.discount_rate, 0.01) * self.durations[paid])
         self.reward_scale = 100.0 / float(forever.max())

@@ -16,6 +16,7 @@ def check_load_arguments(
     path: str | pathlib.Path | io.BufferedIOBase,
     arguments: dict[str, Any],
     kept: Collection[str],
+    older: dict[str, Any] | None = None,
 ) -> dict[str, Any]:
     """Arguments of ``load`` that take effect: Stable-Baselines3 makes attributes of all, whether anything reads them or not.
 
@@ -23,6 +24,7 @@ def check_load_arguments(
     :param path: of the file
     :param arguments: what was passed to ``load`` beside its own parameters
     :param kept: names of those that only the file's value is right for, because the networks were trained with it
+    :param older: values of those that the file says nothing of, because its version did not have them
     :return: the arguments by the names of their attributes
     :raises TypeError: for an argument that the class's constructor does not have
     :raises ValueError: for one of ``kept`` that differs from the file's
@@ -35,6 +37,7 @@ def check_load_arguments(
     if fixed:
         data, _, _ = load_from_zip_file(path, device="cpu")
         assert data is not None
+        data = {**(older or {}), **data}
         differing = {name: arguments[name] for name in fixed if not _equal(arguments[name], data.get(name))}
         if differing:
             of_file = {name: data.get(name) for name in differing}

@@ -1,5 +1,6 @@
 """The base of off-policy algorithms that decide by options: environments, replay buffer, time accounting."""
 
+import dataclasses
 import io
 import json
 import math
@@ -129,14 +130,11 @@ class OptionOffPolicyAlgorithm(OffPolicyAlgorithm):
         self._dt_was_given = dt is not None
         #: τ, in 1/s
         self.discount_rate = discount_rate_from_gamma(gamma, gamma_dt)
-        if updates_per_second is not None:
-            if gradient_steps != -1:
-                raise ValueError(
-                    f"updates_per_second={updates_per_second} and gradient_steps={gradient_steps} both say how often "
-                    "to update: pass one of them"
-                )
-            if not updates_per_second > 0:
-                raise ValueError(f"updates_per_second must be positive or None, not {updates_per_second}")
+        if updates_per_second is not None and gradient_steps != -1:
+            raise ValueError(
+                f"updates_per_second={updates_per_second} and gradient_steps={gradient_steps} both say how often "
+                "to update: pass one of them"
+            )
         self.updates_per_second = updates_per_second
         self.n_sub_options = n_sub_options
         self._residuals_since_log: list[float] = []
@@ -315,9 +313,10 @@ class OptionOffPolicyAlgorithm(OffPolicyAlgorithm):
             another algorithm wrote the file
         """
         saved = cls._saved_attributes(path)
-        kwargs = check_load_arguments(cls, path, kwargs, cls._kept_when_loaded)
-        if saved:
-            kwargs = {**cls._arguments_of_older_files(saved), **kwargs}
+        older = cls._arguments_of_older_files(saved) if saved else {}
+        if kwargs.get("d_min") == 0.0:
+            kwargs["d_min"] = saved.get("dt")  # as which it was saved
+        kwargs = {**older, **check_load_arguments(cls, path, kwargs, cls._kept_when_loaded, older)}
         if "replay_buffer_kwargs" in kwargs:
             given = kwargs["replay_buffer_kwargs"] or {}
             unit = saved.get("replay_buffer_kwargs", {}).get("reward_scale", 1.0)
@@ -332,6 +331,8 @@ class OptionOffPolicyAlgorithm(OffPolicyAlgorithm):
             kwargs.setdefault("updates_per_second", None)
         elif kwargs.get("updates_per_second") is not None:
             kwargs["gradient_steps"] = -1
+        if "dt" in kwargs:
+            kwargs["_dt_was_given"] = kwargs["dt"] is not None
         if env is not None:
             kwargs["n_envs"] = env.num_envs if isinstance(env, VecEnv) else 1
         model = super().load(path, None, device, custom_objects, print_system_info, force_reset, **kwargs)
@@ -386,6 +387,8 @@ class OptionOffPolicyAlgorithm(OffPolicyAlgorithm):
                 f"replay_buffer_class must be OptionReplayBuffer, DictOptionReplayBuffer or a subclass, not "
                 f"{self.replay_buffer_class.__name__}, which does not keep the durations of options"
             )
+        if self.updates_per_second is not None and not 0 < self.updates_per_second < math.inf:
+            raise ValueError(f"updates_per_second must be positive or None, not {self.updates_per_second}")
         # Once more, since load may have changed gamma.
         self.discount_rate = discount_rate_from_gamma(self.gamma, self.gamma_dt)
         self.replay_buffer_kwargs = {"reward_scale": 1.0, **self.replay_buffer_kwargs, "discount_rate": self.discount_rate}
@@ -421,7 +424,7 @@ class OptionOffPolicyAlgorithm(OffPolicyAlgorithm):
     def load_replay_buffer(self, path: str | pathlib.Path | io.BufferedIOBase, truncate_last_traj: bool = True) -> None:
         """Stable-Baselines3's; what is in the buffer is scaled as this algorithm scales rewards.
 
-        :raises ValueError: if its options were discounted at another rate
+        :raises ValueError: if its options were discounted at another rate, or mean something else
         """
         super().load_replay_buffer(path, truncate_last_traj)
         buffer = self.replay_buffer
@@ -432,6 +435,15 @@ class OptionOffPolicyAlgorithm(OffPolicyAlgorithm):
                 f"the replay buffer in {path} has discount_rate={buffer.discount_rate}, {type(self).__name__} has "
                 f"discount_rate={self.discount_rate}: load it into a model with the same gamma and gamma_dt"
             )
+        if buffer.option_space is not None and None not in (self.dt, self.d_min):
+            # At another rate options last as long.
+            of_buffer = dataclasses.replace(buffer.option_space, dt=self.option_space.dt)
+            for name, (value, found) in self.option_space.differences(of_buffer).items():
+                self.replay_buffer = None
+                raise ValueError(
+                    f"the options in the replay buffer in {path} have {name}={found}, {type(self).__name__} has "
+                    f"{name}={value}: load it into a model with the same"
+                )
         buffer.reward_scale = self.replay_buffer_kwargs["reward_scale"]
         self._tell_buffer()
 

@@ -270,9 +270,12 @@ def parse_target_entropy(name: str, value: str, auto: float) -> float:
     :raises ValueError: if it is neither "auto" nor a number
     """
     try:
-        return auto if value == "auto" else float(value)
+        target = auto if value == "auto" else float(value)
     except ValueError:
-        raise ValueError(f"{name} must be a number, a function of the remaining progress or 'auto', not {value!r}") from None
+        target = math.nan
+    if not math.isfinite(target):
+        raise ValueError(f"{name} must be a number, a function of the remaining progress or 'auto', not {value!r}")
+    return target
 
 
 def _parse_ent_coef(name: str, value: str | float) -> tuple[float, bool]:

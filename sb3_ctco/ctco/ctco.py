@@ -25,9 +25,11 @@ from sb3_ctco.options import DurationScale, Join, Trajectory, default_durations,
 def _parse_penalty(value: float | str | Schedule) -> tuple[float | Schedule, bool]:
     """β_h or what it is a multiple of, and whether it is one.
 
-    :raises ValueError: if ``value`` is neither a number nor a function nor ``"relative_<number of at least 0>"``
+    :raises ValueError: if ``value`` is neither a finite number nor a function nor ``"relative_<number of at least 0>"``
     """
     if not isinstance(value, str):
+        if not callable(value) and not math.isfinite(value):
+            raise ValueError(f"high_freq_penalty must be a finite number, not {value}")
         return value, False
     try:
         coefficient = float(value.removeprefix("relative_")) if value.startswith("relative_") else -1.0
@@ -171,21 +173,6 @@ class CTCO(SoftOptionActorCritic):
         device: th.device | str = "auto",
         _init_setup_model: bool = True,
     ):
-        if entropy_reference not in ENTROPY_REFERENCES:
-            raise ValueError(f"entropy_reference must be one of {ENTROPY_REFERENCES}, not {entropy_reference!r}")
-        if entropy_reference == "paper" and duration_scale != "linear":
-            raise ValueError(
-                "entropy_reference='paper' is of densities over d in s, so it needs duration_scale='linear', not "
-                f"{duration_scale!r}"
-            )
-        if target_decision_rate is not None and not target_decision_rate > 0:
-            raise ValueError(f"target_decision_rate must be a positive number of Hz or None, not {target_decision_rate}")
-        coefficient, _ = _parse_penalty(high_freq_penalty)
-        if target_decision_rate is not None and not (isinstance(coefficient, int | float) and coefficient > 0):
-            raise ValueError(
-                f"with a target_decision_rate, high_freq_penalty={high_freq_penalty} must be a positive number, or relative: "
-                "β_h starts there, and its logarithm is learned"
-            )
         super().__init__(
             policy,
             env,
@@ -266,6 +253,22 @@ class CTCO(SoftOptionActorCritic):
         }
 
     def _setup_model(self) -> None:
+        # Here, since load comes by as well.
+        if self.entropy_reference not in ENTROPY_REFERENCES:
+            raise ValueError(f"entropy_reference must be one of {ENTROPY_REFERENCES}, not {self.entropy_reference!r}")
+        if self.entropy_reference == "paper" and self.duration_scale != "linear":
+            raise ValueError(
+                "entropy_reference='paper' is of densities over d in s, so it needs duration_scale='linear', not "
+                f"{self.duration_scale!r}"
+            )
+        target, (coefficient, _) = self.target_decision_rate, _parse_penalty(self.high_freq_penalty)
+        if target is not None and not 0 < target < math.inf:
+            raise ValueError(f"target_decision_rate must be a positive number of Hz or None, not {target}")
+        if target is not None and not (isinstance(coefficient, int | float) and coefficient > 0):
+            raise ValueError(
+                f"with a target_decision_rate, high_freq_penalty={self.high_freq_penalty} must be a positive number, or "
+                "relative: β_h starts there, and its logarithm is learned"
+            )
         super()._setup_model()
         space, n = self.option_space, self._n_temperatures()
         # Which temperature each entry of an option has: weights by where they stand in an action's trajectory, and d's own.
@@ -280,7 +283,6 @@ class CTCO(SoftOptionActorCritic):
         #: Why updates were made with autograd in the last training; None if they were not
         self.fast_updates_refusal: str | None = None
         if self.target_decision_rate is not None:
-            coefficient, _ = _parse_penalty(self.high_freq_penalty)
             assert isinstance(coefficient, int | float)
             self.log_high_freq_penalty = th.tensor(math.log(coefficient), requires_grad=True)
             self.high_freq_penalty_optimizer = th.optim.Adam([self.log_high_freq_penalty], lr=self.lr_schedule(1))

@@ -39,7 +39,7 @@ class FiGARSAC(SoftOptionActorCritic):
     Karimi et al. 2023, https://arxiv.org/abs/2212.04407.
 
     Steps are primitive environment steps everywhere. An environment that is wrapped already must have been given
-    ``OptionExecutionWrapper(env, n_rbf=1, d_max=K * dt)``.
+    ``OptionExecutionWrapper(env, n_rbf=1, d_max=K * dt, d_min=0, duration_scale="linear")``.
 
     :param policy: the policy model to use (MlpPolicy, CnnPolicy, MultiInputPolicy)
     :param env: the environment to learn from: a Gymnasium id, a bare environment, one in an
@@ -186,6 +186,8 @@ class FiGARSAC(SoftOptionActorCritic):
             )
         if d_max is None:
             d_max = (20 if n_repetitions is None else n_repetitions) * dt
+        elif dt is not None:
+            d_max = steps_in(d_max, dt) * dt
         fixed = {"n_rbf": 1, "d_min": 0.0, "duration_scale": "linear", "join": "free"}
         return super().wrapper_kwargs({**arguments, **fixed, "d_max": d_max})
 
@@ -201,7 +203,7 @@ class FiGARSAC(SoftOptionActorCritic):
 
         :param env: the bare environment
         :param n_sub_options: see :class:`~sb3_ctco.wrappers.OptionExecutionWrapper`; FiGAR-SAC learns without
-        :return: ``OptionExecutionWrapper(Monitor(env), n_rbf=1, d_max=K * dt)``, a Monitor being added where there is none
+        :return: ``OptionExecutionWrapper(Monitor(env), ...)`` of K repetitions, a Monitor being added where there is none
         """
         dt = self.dt if self._dt_was_given else find_dt(env)
         if dt is not None:
@@ -223,13 +225,15 @@ class FiGARSAC(SoftOptionActorCritic):
         if not np.isclose(settings.d_min, settings.dt, rtol=1e-6, atol=0.0):
             raise ValueError(
                 f"the environment's options have d_min={settings.d_min}, but FiGARSAC's shortest repetition is one step, "
-                f"dt={settings.dt}: remove d_min from OptionExecutionWrapper"
+                f"dt={settings.dt}: pass d_min=0 to OptionExecutionWrapper"
             )
         return settings
 
     def _setup_model(self) -> None:
-        self.policy_kwargs = {**self.policy_kwargs, "n_repetitions": self.n_repetitions}
+        # The user's stay as they were, so that a file can be loaded with them.
+        given, self.policy_kwargs = self.policy_kwargs, {**self.policy_kwargs, "n_repetitions": self.n_repetitions}
         super()._setup_model()
+        self.policy_kwargs = given
 
     def _setup_temperatures(self) -> None:
         if isinstance(self.duration_target_entropy, str):

@@ -16,7 +16,7 @@ REWARD_UNITS: tuple[RewardUnit, ...] = ("rate", "impulse")
 
 
 #: Key under which the info of an option that ended tells its option vector, where that is not the action of this step
-PLAYED = "played"
+PLAYED = "option_played"
 #: Key of the infos of steps in which something else was sent than the policy's action: no transitions of the policy
 TAKEN_OVER = "taken_over"
 

@@ -394,6 +394,16 @@ class AsynchronousTrainer(Generic[AlgorithmType]):
             if isinstance(getattr(model, name), th.Tensor):
                 getattr(model, name).data.copy_(getattr(learned, name).data)
         model._n_updates = learned._n_updates
+        unit = (learned.replay_buffer_kwargs or {}).get("reward_scale")
+        if unit is not None:
+            # The critics learned in this unit, which "auto" would find anew, in what is left in the journal.
+            given = model.replay_buffer_kwargs["reward_scale"]
+            if given not in ("auto", unit):
+                raise ValueError(
+                    f"{path} was learned with reward_scale={unit}, not {given}: pass that, or move the file away to learn "
+                    "anew from what was collected"
+                )
+            model.replay_buffer_kwargs["reward_scale"] = model.replay_buffer.reward_scale = unit  # type: ignore[union-attr]
 
     def _count_timesteps(self) -> None:
         if not segments(self._journal_folder):
@@ -426,6 +436,12 @@ def _check_model_and_env(model: Any, env: Any) -> None:
         raise ValueError(
             f"pass one bare Gymnasium environment, not {env}: AsynchronousTrainer wraps it itself, with the settings of "
             "the model"
+        )
+    normalizer = model.get_vec_normalize_env()
+    if normalizer is not None and normalizer.norm_obs:
+        raise ValueError(
+            "the model sees observations through VecNormalize, and AsynchronousTrainer acts without it: normalise them with "
+            "gymnasium.wrappers.NormalizeObservation in the environment, or make a model without"
         )
     if model.replay_buffer_class is not None and issubclass(model.replay_buffer_class, HerReplayBuffer):
         raise ValueError(
@@ -520,7 +536,7 @@ class _JournalBuffer:
         self._model = model
 
     def add(self, obs: Any, next_obs: Any, action: Any, reward: Any, done: Any, infos: list[dict[str, Any]]) -> None:
-        if TAKEN_OVER in infos[0]:
+        if infos[0].get(TAKEN_OVER):
             return  # its option is not what was played
         # Stable-Baselines3 hands over arrays of its own, except for the observations, which the next step writes over.
         transition = Transition(_copy(obs), _copy(next_obs), action, reward, done, infos, self._model.num_timesteps)
@@ -531,17 +547,17 @@ def _meaning(model: OffPolicyAlgorithm) -> dict[str, Any]:
     """What a model's transitions mean, by which another one may or may not learn from them."""
     space = model.observation_space
     leaves = space.spaces if isinstance(space, spaces.Dict) else {"": space}
-    actions: Any = model.action_space
+    box: Any = model.action_space
     options: dict[str, Any] | None = None
     if isinstance(model, OptionOffPolicyAlgorithm):
-        actions = model.primitive_action_space
+        box = model.primitive_action_space
         # A trajectory that is no name is a class, of which JSON keeps the name.
         arguments = model.option_space.arguments
         options = {name: value if isinstance(value, int | float | str) else str(value) for name, value in arguments.items()}
     return {
         "algorithm": type(model).__name__,
         "options": options,
-        "actions": {"low": actions.low.tolist(), "high": actions.high.tolist()},
+        "actions": {"low": box.low.tolist(), "high": box.high.tolist()} if isinstance(box, spaces.Box) else str(box),
         "observations": {name: [list(leaf.shape or ()), str(leaf.dtype)] for name, leaf in leaves.items()},
     }
 

@@ -58,7 +58,7 @@ def with_equal_repeats(records: Sequence[Record]) -> list[Record]:
 
 
 def relative_scores(records: Sequence[Record], metric: str) -> dict[Line, dict[int, np.ndarray]]:
-    """Returns divided by the best mean over seeds at any rate, for each task.
+    """Returns divided by the best mean over seeds at any rate, for each task where that is positive.
 
     :return: by line, then by rate in Hz, ``[n_seeds, n_tasks]``, of the seeds that are complete in all tasks
     """
@@ -67,14 +67,16 @@ def relative_scores(records: Sequence[Record], metric: str) -> dict[Line, dict[i
         task: max(float(np.mean(values)) for rates in by_line(records, task, metric).values() for values in rates.values())
         for task in tasks
     }
+    # What costs have no share of what can be had.
+    tasks = [task for task in tasks if best[task] > 0]
     values = {(_line(record), _rate(record), record["seed"], record["task"]): record[metric] for record in records}
     scores: dict[Line, dict[int, np.ndarray]] = {}
     for line in lines_of(records):
         for rate in sorted({_rate(record) for record in records}):
             seeds = sorted({key[2] for key in values if key[:2] == (line, rate)})
             complete = [seed for seed in seeds if all((line, rate, seed, task) in values for task in tasks)]
-            if complete:
-                matrix = [[values[line, rate, seed, task] / max(best[task], 1e-9) for task in tasks] for seed in complete]
+            if complete and tasks:
+                matrix = [[values[line, rate, seed, task] / best[task] for task in tasks] for seed in complete]
                 scores.setdefault(line, {})[rate] = np.array(matrix)
     return scores
 
