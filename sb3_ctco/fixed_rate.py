@@ -65,8 +65,8 @@ class QuickSACPolicy(SACPolicy):
         is_vector = isinstance(space, spaces.Box) and not is_image_space(space) and extractor is FlattenExtractor
         if self.actor.use_sde or activation is not nn.ReLU or not is_vector:
             raise ValueError(
-                f"QuickSACPolicy is for vectors, ReLU and no gSDE, not for {extractor.__name__} of {space}, "
-                f"{activation.__name__} and use_sde={self.actor.use_sde}: use SACPolicy"
+                f"QuickSACPolicy is for vectors, ReLU and no gSDE, not for {extractor.__name__}, {activation.__name__}, "
+                f"use_sde={self.actor.use_sde} and observations in {space}: use SACPolicy"
             )
 
     def set_training_mode(self, mode: bool) -> None:

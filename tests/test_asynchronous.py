@@ -1,6 +1,7 @@
 """Acting and learning in two processes: what is stored, what comes back, and how it ends."""
 
 import itertools
+import json
 import logging
 import math
 import multiprocessing
@@ -21,8 +22,9 @@ import torch as th
 from conftest import PATIENCE
 from gymnasium import spaces
 from gymnasium.error import ResetNeeded
-from stable_baselines3 import PPO, SAC
+from stable_baselines3 import DQN, PPO, SAC
 from stable_baselines3.common.callbacks import BaseCallback, CheckpointCallback
+from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 
 from sb3_ctco import CTCO, FiGARSAC, OptionExecutionWrapper
 from sb3_ctco.realtime import AsynchronousTrainer, JournalError, JournalReader, LearnerError, Transition
@@ -947,3 +949,31 @@ def test_a_policy_that_diverges_stops_nothing(tmp_path):
     assert trainer.real_time.total_statistics.safe_ticks == 40
     assert set(machine.commands) == {0.0}
     assert records_of(tmp_path) == []
+
+
+@pytest.mark.parametrize("given", ["auto", 1.0])
+def test_the_unit_that_critics_learned_in_is_resumed(given, tmp_path):
+    """Another unit, found anew in what the journal has left, would be that of other critics."""
+    model = make_model(CTCO, Point(), buffer_size=500, replay_buffer_kwargs={"reward_scale": "auto"}).learn(60)
+    unit = model.replay_buffer.reward_scale
+    assert unit not in ("auto", 1.0)
+    model.save(tmp_path / "model.zip")
+    again = make_model(CTCO, Point(), buffer_size=500, replay_buffer_kwargs={"reward_scale": given})
+    if given == "auto":
+        AsynchronousTrainer(again, Point(), tmp_path, resume=True, real_time=False)
+        assert again.replay_buffer.reward_scale == again.replay_buffer_kwargs["reward_scale"] == unit
+    else:
+        with pytest.raises(ValueError, match=r"was learned with reward_scale=.*, not 1.0: pass that"):
+            AsynchronousTrainer(again, Point(), tmp_path, resume=True, real_time=False)
+
+
+def test_a_model_of_normalised_observations_is_refused(tmp_path):
+    model = make_model(SAC, VecNormalize(DummyVecEnv([Point]), norm_reward=False))
+    with pytest.raises(ValueError, match=r"sees observations through VecNormalize.*NormalizeObservation"):
+        AsynchronousTrainer(model, Point(), tmp_path, real_time=False)
+
+
+def test_the_journal_knows_actions_that_are_no_box(tmp_path):
+    meaning = trainer_module._meaning(make_model(DQN, "CartPole-v1", buffer_size=100))
+    assert meaning["actions"] == "Discrete(2)"
+    json.dumps(meaning)

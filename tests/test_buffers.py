@@ -235,3 +235,22 @@ def test_what_somebody_else_did_is_no_transition_of_the_policy(kind):
     add(buffer, kind, 1, [option_info(1.0, 3.0) | {"taken_over": True}, option_info(1.0, 4.0)])
     assert buffer.size() == buffer.n_decisions == 1
     assert buffer.integrated_rewards[0, 0] == 4.0
+
+
+def test_a_scale_waits_until_a_row_pays():
+    """What was paid may have been overwritten."""
+    buffer = OptionReplayBuffer(2, VECTOR, OPTION_SPACE, device="cpu", discount_rate=TAU, reward_scale="auto")
+    for value, paid in enumerate((3.0, 0.0, 0.0)):
+        add(buffer, "vector", value, [option_info(1.0, paid)])
+    assert buffer.found_reward_scale() == 1.0
+    add(buffer, "vector", 3, [option_info(1.0, 2.0)])
+    assert buffer.found_reward_scale() == pytest.approx(100 / 4)  # 2 a second for one halves: 4 forever
+
+
+def test_a_key_of_an_environments_own_means_nothing():
+    """Only what the package's own environments say keeps a decision out."""
+    buffer = make_buffer("vector")
+    for key, value in (("pending", True), ("played", np.ones(3)), ("taken_over", False)):
+        add(buffer, "vector", 1, [option_info(1.0, 3.0) | {key: value}])
+    assert buffer.size() == 3
+    np.testing.assert_allclose(buffer.actions[:3, 0], 0.1)

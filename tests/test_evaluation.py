@@ -205,3 +205,32 @@ def test_a_policy_with_a_memory_gets_it_back(scripted_env):
     seen: list[int] = []
     evaluate_discounted_return(Counter([0.0]), scripted_env(truncate_at=3), 2, dt=0.1)
     assert seen == [1, 2, 3, 1, 2, 3]
+
+
+class ShortOrLong(CountingEnv):
+    """Pays 1 a step; its first episode has ``first`` steps, all others one."""
+
+    def __init__(self, first):
+        self.lengths = iter([first, *[1] * 100])
+
+    def reset(self, *, seed=None, options=None):
+        self.length = next(self.lengths)
+        return super().reset(seed=seed, options=options)
+
+    def step(self, action):
+        obs, *_ = super().step(action)
+        return obs, 1.0, False, self.n_steps == self.length, {}
+
+
+def test_each_environment_plays_its_share_of_the_episodes():
+    """The first four to end are those of the quick environments, of one step each."""
+    envs = DummyVecEnv([lambda first=first: ShortOrLong(first) for first in (9, 1, 1)])
+    episodes = evaluate_discounted_return(Scripted([1.0]), envs, 4, discount_rate=TAU, dt=DT)
+    # (4 + i) // 3 of the i-th, as Stable-Baselines3 shares them
+    assert sorted(episode.episode_return for episode in episodes) == [1.0, 1.0, 1.0, 9.0]
+
+
+def test_the_smoothness_of_rewards_as_rates():
+    env = RewardRateWrapper(CountingEnv(), discount_rate=TAU)
+    (episode,) = evaluate_discounted_return(Scripted([0.0], [4.0]), env, 1, smoothness=True)
+    assert episode.largest_jump == 2.0  # through the whole of [−1, 1]

@@ -9,6 +9,7 @@ import torch as th
 from hypothesis import given
 from hypothesis import strategies as st
 from stable_baselines3 import SAC
+from stable_baselines3.common.buffers import ReplayBuffer
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.monitor import Monitor
 
@@ -350,3 +351,29 @@ def test_docstring_examples(documented):
     result = doctest.testmod(documented)
     assert result.attempted > 0
     assert result.failed == 0
+
+
+def test_the_quick_policy_refuses_pictures_and_numbers_of_states(random_walk_env):
+    """Whose observations Stable-Baselines3 scales or encodes, which it does not."""
+
+    class States(random_walk_env):
+        def __init__(self):
+            super().__init__()
+            self.observation_space = gym.spaces.Discrete(4)
+
+        def _obs(self):
+            return np.int64(self.count % 4)
+
+    for env in (random_walk_env("image"), States()):
+        with pytest.raises(ValueError, match="for vectors, .*: use SACPolicy"):
+            sac_at_rate(env, 0.1, policy=QuickSACPolicy, **SMALL)
+
+
+def test_what_holding_actions_does_with_the_replay_buffers_arguments(scripted_env, random_walk_env):
+    kwargs = {"handle_timeout_termination": False}
+    model = sac_at_rate(scripted_env(), 0.1, hold_seconds=0.2, replay_buffer_kwargs=kwargs, **SMALL)
+    assert not model.replay_buffer.handle_timeout_termination
+    with pytest.raises(TypeError, match="sets replay_buffer_class itself, not to ReplayBuffer"):
+        sac_at_rate(scripted_env(), 0.1, hold_seconds=0.2, replay_buffer_class=ReplayBuffer, **SMALL)
+    with pytest.raises(ValueError, match=r"in one array, not in Dict.*FlattenObservation"):
+        sac_at_rate(random_walk_env("dict"), 0.1, policy="MultiInputPolicy", hold_seconds=0.2, **SMALL)

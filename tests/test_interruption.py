@@ -102,8 +102,9 @@ def test_bad_arguments(toy, random_walk_env):
         CriticInterrupt(FiGARSAC("MlpPolicy", random_walk_env(), **SMALL), 0.1)
     with pytest.raises(TypeError, match=r"to follow a rule of your own, call decide_anew\(\)"):
         OptionController(toy, interrupt=lambda *_: True)
-    with pytest.raises(ValueError, match="replan_period must be a positive number of seconds or None, not 0"):
-        OptionController(toy, replan_period=0)
+    for period in (0, np.inf):
+        with pytest.raises(ValueError, match=f"replan_period must be a positive number of seconds or None, not {period}"):
+            OptionController(toy, replan_period=period)
     with pytest.raises(ValueError, match="decided on already with decide_ahead"):
         RealTimeOptionWrapper(random_walk_env(), decide_ahead=0.1, interrupt=Scripted(0.2), **SETTINGS)
 

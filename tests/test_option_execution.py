@@ -504,3 +504,8 @@ def test_options_mean_the_same_where_a_step_takes_longer_than_the_shortest(scrip
         env = model.wrap_env(scripted_env(dt=dt))
         env.reset()
         assert env.step([0.0, -0.5])[4]["option"]["n_steps"] == n_steps
+
+
+def test_whole_numbers_are_no_continuous_actions(scripted_env):
+    with pytest.raises(TypeError, match=r"actions that are real numbers, not Box\(-3, 3, \(1,\), int8\)"):
+        OptionExecutionWrapper(scripted_env(action_space=spaces.Box(-3, 3, (1,), np.int8)))

@@ -375,3 +375,22 @@ def test_an_option_that_is_not_finite(ahead, join):
     unguarded.reset()
     with pytest.raises(ValueError, match="must be finite"):
         unguarded.step([np.nan, 1.0])
+
+
+def test_the_safe_action_ends_an_option_in_the_plain_wrapper_too():
+    """Eyes shut after the second of ten steps: the third action is the safe one, and ends an option that is nobody's."""
+
+    class Blind(Machine):
+        def receive(self):
+            obs, reward, terminated, truncated, info = super().receive()
+            return obs, reward, terminated, truncated, {**info, "observation_age": 9.9 if len(self.commands) == 2 else 0.0}
+
+    machine = Blind()
+    env = OptionExecutionWrapper(RealTimeWrapper(machine, clock=Clock(), safety=Safety(**UNLIMITED)), n_rbf=1, d_max=1.0)
+    env.reset()
+    *_, info = env.step([0.5, 1.0])
+    assert info["option"]["n_steps"] == len(machine.commands) == 3
+    assert info["taken_over"]
+    *_, info = env.step([0.5, 1.0])
+    assert "taken_over" not in info
+    assert info["option"]["n_steps"] == 10

@@ -1,7 +1,8 @@
-"""Models and replay buffers that version 0.1.0 saved, in tests/data: they act as they did, and learn on."""
+"""Saved models and replay buffers: those of version 0.1.0, in tests/data, act as they did and learn on; what `load` refuses."""
 
 import base64
 import json
+import math
 from pathlib import Path
 
 import gymnasium as gym
@@ -63,3 +64,53 @@ def test_the_features_extractor_is_found_where_0_1_0_had_it(monkeypatch):
         saved = data_to_json({"policy_kwargs": {"features_extractor_class": SpatialSoftmaxExtractor}})
     assert b"sb3_ctco.common.spatial_softmax" in base64.b64decode(json.loads(saved)["policy_kwargs"][":serialized:"])
     assert json_to_data(saved)["policy_kwargs"]["features_extractor_class"] is SpatialSoftmaxExtractor
+
+
+@pytest.mark.parametrize(
+    ("kwargs", "message"),
+    [
+        ({"entropy_reference": "avarage"}, "entropy_reference must be one of .*, not 'avarage'"),
+        ({"entropy_reference": "paper"}, "needs duration_scale='linear', not 'log'"),
+        ({"updates_per_second": -5.0}, "updates_per_second must be positive or None, not -5.0"),
+        ({"updates_per_second": math.inf}, "updates_per_second must be positive or None, not inf"),
+        ({"high_freq_penalty": "foo"}, "or 'relative_<number of at least 0>', such as 'relative_0.1', not 'foo'"),
+        ({"high_freq_penalty": math.nan}, "high_freq_penalty must be a finite number, not nan"),
+        ({"target_entropy": "nan"}, "target_entropy must be a number, a function of the remaining progress or 'auto'"),
+        ({"n_sub_options": 2.5}, "n_sub_options must be a whole number of at least 0, not 2.5"),
+    ],
+)
+def test_load_checks_what_the_constructor_checks(kwargs, message, tmp_path):
+    with pytest.raises(ValueError, match=message):
+        CTCO("MlpPolicy", "Pendulum-v1", buffer_size=10, **kwargs)
+    CTCO("MlpPolicy", "Pendulum-v1", buffer_size=10).save(tmp_path / "model")
+    with pytest.raises(ValueError, match=message):
+        CTCO.load(tmp_path / "model", env=gym.make("Pendulum-v1"), **kwargs)
+
+
+def test_a_file_is_loaded_with_what_it_was_made_with(tmp_path):
+    given = {"d_min": 0, "trajectory": "rbf", "policy_kwargs": {"net_arch": [8]}}
+    CTCO("MlpPolicy", "Pendulum-v1", buffer_size=10, **given).save(tmp_path / "ctco")
+    assert CTCO.load(tmp_path / "ctco", env=gym.make("Pendulum-v1"), **given).d_min == 0.05
+    FiGARSAC("MlpPolicy", "Pendulum-v1", buffer_size=10, policy_kwargs={"net_arch": [8]}).save(tmp_path / "figar_sac")
+    assert FiGARSAC.load(tmp_path / "figar_sac", policy_kwargs={"net_arch": [8]}).n_repetitions == 20
+    with pytest.raises(ValueError, match=r"'d_min': 0.05.*cannot be changed while loading"):
+        CTCO("MlpPolicy", "Pendulum-v1", buffer_size=10, d_min=0.1).save(tmp_path / "longer")
+        CTCO.load(tmp_path / "longer", d_min=0)
+
+
+def test_a_dt_that_is_given_to_load_is_the_users_word(tmp_path):
+    CTCO("MlpPolicy", "Pendulum-v1", buffer_size=10).save(tmp_path / "model")
+    model = CTCO.load(tmp_path / "model", env=gym.make("Pendulum-v1"), dt=0.1)
+    assert model.dt == model.get_env().get_attr("option_space")[0].dt == 0.1
+
+
+def test_a_replay_buffer_whose_options_mean_something_else_is_refused(tmp_path):
+    CTCO("MlpPolicy", "Pendulum-v1", buffer_size=100, d_max=0.5).save_replay_buffer(tmp_path / "buffer")
+    with pytest.raises(ValueError, match=r"options in the replay buffer in .* have d_max=0.5, CTCO has d_max=2.0"):
+        CTCO("MlpPolicy", "Pendulum-v1", buffer_size=100, d_max=2.0).load_replay_buffer(tmp_path / "buffer")
+    model = CTCO("MlpPolicy", "Pendulum-v1", buffer_size=100, d_max=0.5, d_min=0.1, dt=0.025)
+    with pytest.raises(ValueError, match=r"have d_min=0.05, CTCO has d_min=0.1"):
+        model.load_replay_buffer(tmp_path / "buffer")
+    model = CTCO("MlpPolicy", "Pendulum-v1", buffer_size=100, d_max=0.5, d_min=0.05, dt=0.025)
+    model.load_replay_buffer(tmp_path / "buffer")  # at another rate options last as long
+    assert model.replay_buffer.option_space.dt == 0.025

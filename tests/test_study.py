@@ -969,3 +969,22 @@ def test_the_smoke_preset(tmp_path):
             assert record["decision_rate_hz"] < 1 / record["dt"]
     assert main(["plot", str(folder)]) == 0
     assert "FiGAR-SAC" in (folder / "figures" / "table.md").read_text()
+
+
+def test_tasks_that_cost_have_no_score():
+    name = "Pendulum-v1"
+    values = {**{"ctco_cheetah_50": [1, 1], f"ctco_{name}_50": [-2, -3]}, **{"sac_cheetah_50": [2, 2], f"sac_{name}_50": [-4, -1]}}
+    records = scored(**values)
+    assert scores.relative_scores(records, "discounted_return")["ctco", "a"][50].tolist() == [[0.5], [0.5]]
+    costs = [record for record in records if record["task"] == name]
+    assert scores.relative_scores(costs, "discounted_return") == {}
+
+
+@pytest.mark.parametrize("name", ["seed", "device", "dt", "n_envs"])
+def test_a_preset_does_not_say_what_the_study_says(name, tmp_path):
+    preset = yaml.safe_load(Path(tiny(tmp_path)).read_text())
+    preset["algorithms"]["ctco"]["arguments"][name] = 1
+    file = tmp_path / "other.yml"
+    file.write_text(yaml.safe_dump(preset))
+    with pytest.raises(ValueError, match=rf"ctco \(small\) has no arguments \['{name}'\]"):
+        agents.constructor_arguments(load_preset(str(file)).select()[0])

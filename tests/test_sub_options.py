@@ -464,3 +464,29 @@ def test_an_option_has_fewer_sub_options_than_steps():
             assert all(0 <= first < end <= n_steps and (first, end) != (0, n_steps) for first, end in drawn)
             counts.append(len(drawn))
         assert max(counts) == min(8, n_steps - 1)
+
+
+def test_an_end_at_the_time_limit_is_an_end(random_walk_env):
+    """Gymnasium's TimeLimit truncates at its last step also an episode that terminates with it."""
+
+    class Ends(random_walk_env):
+        def step(self, action):
+            obs, reward, _, _, info = super().step(action)
+            return obs, reward, self.count == 20, False, info
+
+    model = make(gym.wrappers.TimeLimit(Ends(), 20), d_min=0.1, learning_starts=10**6).learn(200)
+    buffer = model.replay_buffer
+    size = buffer.size()
+    last = buffer.next_observations[:size, 0, 1] == 1.0
+    assert last.sum() > 10  # of options and of sub-options
+    np.testing.assert_array_equal((buffer.dones * (1 - buffer.timeouts))[:size, 0], last)
+    space = model.option_space
+    rows = buffer.size()
+    added = buffer.add_trajectory(
+        np.linspace(0, 1, 8).reshape(4, 2), np.zeros((3, 1)), np.ones(3), True, True, space.dt, n_stretches=2
+    )
+    assert added.added > 0
+    assert buffer.size() == rows + added.added
+    ended = buffer.dones[-added.added :, 0] == 1
+    assert ended.any()
+    assert not buffer.timeouts[-added.added :].any()

@@ -72,17 +72,17 @@ def test_who_is_ready_is_returned_and_who_runs_keeps_its_option(slow_and_fast):
     env, first = slow_and_fast
     # Environment 0 plays ten slow steps, 1 one fast step: x moves by 0.1·2·value a step.
     obs, rewards, dones, infos = env.step(np.stack([option(0.25, 1.0), option(-0.5, -1.0)]))
-    assert infos[0] == {"pending": True}
+    assert infos[0] == {"option_pending": True}
     np.testing.assert_array_equal(obs[0], first[0])
     assert rewards[0] == 0
     assert not dones.any()
     assert infos[1]["option"]["n_steps"] == 1
-    np.testing.assert_array_equal(infos[1]["played"], option(-0.5, -1.0))
+    np.testing.assert_array_equal(infos[1]["option_played"], option(-0.5, -1.0))
     assert obs[1, 0] == pytest.approx(max(first[1, 0] - 0.1, -1))
     # What is asked of 0 next is ignored; it ends what it began.
-    while "pending" in infos[0]:
+    while "option_pending" in infos[0]:
         obs, _, _, infos = env.step(np.stack([option(-1.0, -1.0), option(-0.5, -1.0)]))
-    np.testing.assert_array_equal(infos[0]["played"], option(0.25, 1.0))
+    np.testing.assert_array_equal(infos[0]["option_played"], option(0.25, 1.0))
     assert infos[0]["option"]["n_steps"] == 10
     assert obs[0, 0] == pytest.approx(min(first[0, 0] + 0.5, 1), abs=1e-5)
 
@@ -91,7 +91,7 @@ def test_questions_and_resets_wait_for_options_that_run(slow_and_fast):
     env, _ = slow_and_fast
     actions = np.stack([option(0.25, 1.0), option(-0.5, -1.0)])
     infos = env.step(actions)[3]
-    assert "pending" in infos[0]
+    assert "option_pending" in infos[0]
     assert env.get_attr("dt") == [0.1, 0.1]
     # 0 has ended meanwhile, which the next step tells at once.
     assert "option" in env.step(actions)[3][0]
@@ -241,7 +241,7 @@ def test_the_callers_actions_stay_as_they_are(random_walk_env, n_envs):
                 "integrated_reward": 0.0,
                 "discount": np.exp(-0.1 * model.discount_rate),
             },
-            "played": np.full(3, 0.1, dtype=np.float32),
+            "option_played": np.full(3, 0.1, dtype=np.float32),
         }
         for _ in range(n_envs)
     ]

@@ -346,7 +346,7 @@ class OptionExecutionWrapper(gym.Wrapper, RecordConstructorArgs):
                 if joined and LAST_ACTION in info:
                     sent[len(rewards) - 1] = info[LAST_ACTION]
                 # What was sent in place of an action ends its option, as the end of an episode does.
-                ended = terminated or truncated or info.get(TAKEN_OVER)
+                ended = terminated or truncated or (isinstance(info, dict) and info.get(TAKEN_OVER))
                 if ended:
                     break
             if ended:
