@@ -365,7 +365,7 @@ def test_the_quick_policy_refuses_pictures_and_numbers_of_states(random_walk_env
             return np.int64(self.count % 4)
 
     for env in (random_walk_env("image"), States()):
-        with pytest.raises(ValueError, match="for vectors, .*: use SACPolicy"):
+        with pytest.raises(ValueError, match=r"for vectors, .*: use SACPolicy"):
             sac_at_rate(env, 0.1, policy=QuickSACPolicy, **SMALL)
 
 

@@ -1,4 +1,4 @@
-"""Saved models and replay buffers: those of version 0.1.0, in tests/data, act as they did and learn on; what `load` refuses."""
+"""Saved models and replay buffers: those of version 0.1.0, in tests/data, act as before and learn on; what load refuses."""
 
 import base64
 import json

@@ -973,7 +973,7 @@ def test_the_smoke_preset(tmp_path):
 
 def test_tasks_that_cost_have_no_score():
     name = "Pendulum-v1"
-    values = {**{"ctco_cheetah_50": [1, 1], f"ctco_{name}_50": [-2, -3]}, **{"sac_cheetah_50": [2, 2], f"sac_{name}_50": [-4, -1]}}
+    values = {"ctco_cheetah_50": [1, 1], f"ctco_{name}_50": [-2, -3], "sac_cheetah_50": [2, 2], f"sac_{name}_50": [-4, -1]}
     records = scored(**values)
     assert scores.relative_scores(records, "discounted_return")["ctco", "a"][50].tolist() == [[0.5], [0.5]]
     costs = [record for record in records if record["task"] == name]
