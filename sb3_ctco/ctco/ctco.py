@@ -97,7 +97,7 @@ class CTCO(SoftOptionActorCritic):
         :class:`~sb3_ctco.wrappers.OptionExecutionWrapper`
     :param high_freq_penalty: β_h, subtracted once a decision in the critic's target: a number, or a function of the remaining
         progress, in the unit of R times the buffer's ``reward_scale``; or ``"relative_0.1"`` for a tenth of the absolute
-        reward that is paid in ``d_min`` on average, by all options so far that paid anything, which depends on no unit
+        reward that is paid in ``d_min``, by the last options that paid anything, which depends on no unit
     :param target_decision_rate: in Hz, in place of a fixed β_h: ``high_freq_penalty`` is where β_h starts, and it rises
         while the policy decides more often than this, and falls while it decides less often
     :param ent_coef: temperature, a number, in the unit of β_h; ``"auto"`` to learn one for each of the ``n_rbf`` weights of a
