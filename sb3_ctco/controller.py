@@ -446,7 +446,10 @@ class OptionController:
 
     @property
     def option(self) -> np.ndarray:
-        """The option that runs, normalised to [−1, 1]: ``[option_dim]``, or ``[n, option_dim]``."""
+        """The option that runs, normalised to [−1, 1]: ``[option_dim]``, or ``[n, option_dim]``.
+
+        This and the three below are NaN while the safe action is sent.
+        """
         return self._for_each([e.option for e in self._running()])
 
     @property
@@ -467,9 +470,15 @@ class OptionController:
         return self._for_each(np.maximum(np.asarray(self.duration) - self.elapsed, 0.0).reshape(-1).tolist())
 
     def _running(self) -> list[_Execution]:
-        if not self._executions:
+        if self._executions:
+            return self._executions
+        if self._now is None:
             raise ValueError("no option runs: call the controller with an observation first")
-        return self._executions
+        # The safe action is being sent. Whoever logs goes on.
+        nan: Any = math.nan
+        nothing = np.full(self._box.low.size * self.settings.arguments["n_rbf"] + 1, nan, np.float32)
+        n = len(self._first) if self._several and self._first is not None else 1
+        return [_Execution(nothing, nan, nothing, nothing, nothing, start=nan)] * n
 
     def _for_each(self, values: list[Any]) -> Any:
         return np.stack(values) if self._several else values[0]

@@ -68,7 +68,7 @@ class OnnxPolicy:
         several, feed = False, {}
         for name, (shape, dtype) in self._observations.items():
             leaf = np.asarray(leaves[name], dtype=dtype)
-            if leaf.shape[-len(shape) :] != shape or leaf.ndim not in (len(shape), len(shape) + 1):
+            if leaf.ndim not in (len(shape), len(shape) + 1) or leaf.shape[leaf.ndim - len(shape) :] != shape:
                 raise ValueError(f"{name} must have shape {shape} or [n, {', '.join(map(str, shape))}], not {leaf.shape}")
             several = leaf.ndim > len(shape)
             feed[name] = leaf.reshape(-1, *shape)

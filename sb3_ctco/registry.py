@@ -90,7 +90,7 @@ def find_task(name: str) -> Task:
         return TASKS[name]
     if gym.spec(name).entry_point == "sb3_ctco.envs.dm_control:DMControlEnv" and "dt" not in gym.spec(name).kwargs:
         return Task(name, name.removeprefix("sb3_ctco/").removesuffix("-v0"), name)
-    return Task(name, name, name, any_rate=False, episode_seconds=None)
+    return Task(name, name, name, any_rate=False, episode_seconds=gym.spec(name).kwargs.get("time_limit"))
 
 
 #: Parameters of constructors that follow from a run's place in the grid, or are the same for all runs
@@ -131,6 +131,12 @@ class Algorithm:
         :param where: names the place in an error
         :raises ValueError: if one is unknown, or ``gamma``, ``gamma_dt`` or ``updates_per_second`` is missing
         """
+        for name in ("learning_starts_seconds", "rollout_seconds", "action_repeat"):
+            value = given.get(name, 1)
+            if isinstance(value, bool) or not isinstance(value, int | float) or value < 0:
+                raise ValueError(f"{where} has {name}={value!r}, which must be a number of at least 0 (to YAML 6e1 is none)")
+        if "rollout_seconds" in given and not episode_seconds > 0:
+            raise ValueError(f"{where} has rollout_seconds, whole episodes of a task that has no longest one: pass n_steps")
         arguments = self.in_steps(dict(given), dt, episode_seconds)
         known = {name for constructor in self.constructors for name in inspect.signature(constructor).parameters}
         unknown = sorted(set(arguments) - known | set(arguments) & _SAID_BY_THE_STUDY)

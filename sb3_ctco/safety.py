@@ -1,6 +1,7 @@
 """What is sent to a machine when a decision cannot be relied on, and how fast commands may change."""
 
 import logging
+import math
 from collections import Counter
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -65,9 +66,11 @@ class Guard:
     def start(self, action: Any) -> None:
         """Begin anew.
 
-        :param action: the one that is being sent; None if that is not known: the next one may then be any
+        :param action: the one that is being sent; None if that is not known, as one that is not finite is not: the next one
+            may then be any
         """
-        self._sent = None if action is None else np.array(action, np.float64).reshape(self.low.shape)
+        known = action is not None and np.isfinite(action).all()
+        self._sent = np.array(action, np.float64).reshape(self.low.shape) if known else None
         self._rate = np.zeros(self.low.shape)
 
     def command(self, action: np.ndarray, seconds: float, age: float = 0.0, reason: str | None = None) -> np.ndarray:
@@ -79,7 +82,7 @@ class Guard:
         :param reason: why it is not to be sent, if that is known already
         :return: an array of its own, in the precision of the bounds
         """
-        if reason is None and age > self.safety.stale_after:
+        if reason is None and not age <= self.safety.stale_after:
             reason = "no fresh observation"
         if reason is None and not np.isfinite(action).all():
             reason = "the action is not finite"
@@ -111,7 +114,7 @@ class Guard:
         return sent
 
     def _limited(self, action: np.ndarray, seconds: float) -> np.ndarray:
-        max_rate, max_slew = self.safety.max_rate, self.safety.max_slew
+        max_rate, max_slew = (None if limit == math.inf else limit for limit in (self.safety.max_rate, self.safety.max_slew))
         if self._sent is None or (max_rate is None and max_slew is None):
             return action
         if seconds <= 0.0:

@@ -168,6 +168,15 @@ def with_defaults(command: str, arguments: Sequence[str]) -> list[str]:
     return [*defaults, *arguments]
 
 
+def _check_sampler(flags: Sequence[str]) -> None:
+    parser = argparse.ArgumentParser(add_help=False)
+    parser.add_argument("--algo")
+    parser.add_argument("-optimize", "--optimize-hyperparameters", action="store_true")
+    given, _ = parser.parse_known_args(flags)
+    if given.optimize_hyperparameters and given.algo not in HYPERPARAMS_SAMPLER:
+        sys.exit(f"hyperparameters are searched for {', '.join(sorted(HYPERPARAMS_SAMPLER))}, not for {given.algo}")
+
+
 def main(arguments: Sequence[str]) -> None:
     """RL Zoo's part of the command ``sb3-ctco``.
 
@@ -176,7 +185,9 @@ def main(arguments: Sequence[str]) -> None:
     command, *flags = arguments
     mute_deprecated_attributes()
     argv, manager = sys.argv, rl_zoo3.train.ExperimentManager
-    sys.argv = [f"sb3-ctco {command}", *with_defaults(command, flags)]
+    flags = with_defaults(command, flags)
+    _check_sampler(flags)
+    sys.argv = [f"sb3-ctco {command}", *flags]
     rl_zoo3.train.ExperimentManager = OptionExperimentManager  # type: ignore[misc]
     if command == "enjoy":
         print("With an algorithm of options, a timestep of -n and of Episode Length is a decision, not an environment step.")

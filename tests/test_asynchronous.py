@@ -1,7 +1,6 @@
 """Acting and learning in two processes: what is stored, what comes back, and how it ends."""
 
 import itertools
-import json
 import logging
 import math
 import multiprocessing
@@ -27,7 +26,7 @@ from stable_baselines3.common.callbacks import BaseCallback, CheckpointCallback
 from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 
 from sb3_ctco import CTCO, FiGARSAC, OptionExecutionWrapper
-from sb3_ctco.realtime import AsynchronousTrainer, JournalError, JournalReader, LearnerError, Transition
+from sb3_ctco.realtime import AsynchronousTrainer, JournalError, JournalReader, JournalWriter, LearnerError, Transition
 from sb3_ctco.realtime import trainer as trainer_module
 from sb3_ctco.realtime.weights import SharedWeights
 from sb3_ctco.safety import Safety
@@ -973,7 +972,78 @@ def test_a_model_of_normalised_observations_is_refused(tmp_path):
         AsynchronousTrainer(model, Point(), tmp_path, real_time=False)
 
 
-def test_the_journal_knows_actions_that_are_no_box(tmp_path):
-    meaning = trainer_module._meaning(make_model(DQN, "CartPole-v1", buffer_size=100))
-    assert meaning["actions"] == "Discrete(2)"
-    json.dumps(meaning)
+def test_discrete_actions_are_refused(tmp_path):
+    model = make_model(DQN, "CartPole-v1", buffer_size=100)
+    with pytest.raises(ValueError, match=r"needs continuous actions, not Discrete\(2\)"):
+        AsynchronousTrainer(model, gym.make("CartPole-v1"), tmp_path, real_time=False)
+
+
+def test_the_safe_stop_is_sent_when_what_was_taken_over_cannot_be_recorded(tmp_path):
+    stopped = []
+    env = Point()
+    trainer = AsynchronousTrainer(
+        make_model(CTCO, env, buffer_size=100),
+        env,
+        tmp_path,
+        real_time=False,
+        take_over=lambda obs: [0.9] if round(obs[1] / env.dt) % 4 < 2 else None,
+        safe_stop=stopped.append,
+    )
+    # What learn does, without the learner's process
+    trainer._demonstrations = JournalWriter(tmp_path / "demonstrations", trainer_module._meaning(trainer.model))
+    trainer._demonstrations._error = OSError(28, "No space left on device")  # as the writer's thread leaves it
+    model = trainer.model
+    model.env.reset()
+    with pytest.raises(OSError, match="No space left"):
+        for _ in range(10):
+            model.env.step(np.zeros((1, *model.action_space.shape), np.float32))
+    trainer._make_safe()
+    assert stopped == [env]
+
+
+def test_what_is_learned_from_twice_begins_with_a_reset_and_has_the_learners_price(tmp_path):
+    env = gym.make("Pendulum-v1")
+    model = make_model(CTCO, env, buffer_size=1000)
+    with AsynchronousTrainer(model, env, tmp_path, real_time=False) as trainer:
+        trainer.learn(200)
+        assert model._current_high_freq_penalty() == CTCO.load(tmp_path / "model.zip")._current_high_freq_penalty() > 0
+        trainer.learn(300)
+    assert model.num_timesteps >= 300
+
+
+def test_a_learner_that_died_does_not_stop_the_next(tmp_path):
+    env = Machine()
+    wrapped = gym.wrappers.TimeLimit(env, 400)
+    model = make_model(SAC, wrapped, buffer_size=1000)
+    with AsynchronousTrainer(model, wrapped, tmp_path) as trainer, pytest.raises(LearnerError):
+        trainer.learn(200, KillLearner(60, signal.SIGKILL))
+    n_sent = len(env.commands)
+    with AsynchronousTrainer(make_model(SAC, wrapped, buffer_size=1000), wrapped, tmp_path, resume=True) as trainer:
+        trainer.learn(trainer.model.num_timesteps + 60)
+    assert len({command for command in env.commands[n_sent:] if command != 0.0}) > 20
+
+
+@pytest.mark.parametrize("take_over", [None, lambda obs: None])
+def test_the_clock_the_options_and_what_is_recorded_have_one_period(take_over, tmp_path):
+    env = Point()
+    del env.dt
+    clock = RealTimeWrapper(env, dt=0.05)
+    model = make_model(CTCO, clock, buffer_size=100)
+    assert model.dt == 0.05
+    trainer = AsynchronousTrainer(model, clock, tmp_path / "clock", take_over=take_over)
+    assert trainer.real_time is clock
+    trainer = AsynchronousTrainer(
+        make_model(CTCO, Point(), dt=0.05, buffer_size=100), Point(), tmp_path / "given", take_over=take_over
+    )
+    assert trainer.real_time.dt == trainer.model.env.get_attr("option_space")[0].dt == 0.05
+    assert take_over is None or trainer._take_over.dt == 0.05
+    with pytest.raises(ValueError, match=r"RealTimeWrapper has dt=0.05, the model has dt=0.02: give both the same"):
+        AsynchronousTrainer(make_model(CTCO, Point(), dt=0.02, buffer_size=100), clock, tmp_path / "other")
+
+
+def test_demonstrations_of_an_earlier_run_are_an_earlier_run(tmp_path):
+    model = make_model(CTCO, "Pendulum-v1", buffer_size=1000)
+    trainer = AsynchronousTrainer(model, gym.make("Pendulum-v1"), tmp_path, real_time=False)
+    trainer.add_trajectory(np.zeros((31, 3), np.float32), np.zeros((30, 1)), np.zeros(30), False, True, 0.05)
+    with pytest.raises(FileExistsError, match="holds the experience of an earlier run: pass resume=True"):
+        AsynchronousTrainer(model, gym.make("Pendulum-v1"), tmp_path, real_time=False)

@@ -490,3 +490,35 @@ def test_a_trajectory_without_a_name_cannot_be_exported():
     box = gym.spaces.Box(-1.0, 1.0, (1,))
     with pytest.raises(ValueError, match=r"Line has no name: give it one, sb3_ctco.options.TRAJECTORIES"):
         to_metadata(space, box, {"observation": ((2,), "float32")})
+
+
+def test_an_exported_policy_drives_several_that_observe_a_number(tmp_path):
+    class Numbered(gym.Env):
+        dt = 0.05
+        observation_space = spaces.Discrete(5)
+        action_space = spaces.Box(-1.0, 1.0, (2,), np.float32)
+
+    model = CTCO("MlpPolicy", Numbered(), policy_kwargs={"net_arch": [8]}, buffer_size=10)
+    export_onnx(model, tmp_path / "model.onnx")
+    for observation in (np.array(2), np.array([2, 3])):
+        np.testing.assert_allclose(
+            OptionController(tmp_path / "model.onnx")(observation), OptionController(model)(observation), atol=1e-5
+        )
+    with pytest.raises(ValueError, match=r"must have shape \(\) or \[n, \], not \(2, 1\)"):
+        OptionController(tmp_path / "model.onnx")(np.array([[2], [3]]))
+
+
+def test_what_a_controller_tells_while_the_safe_action_is_sent(pendulum_model):
+    controller = OptionController(pendulum_model)
+    with pytest.raises(ValueError, match="call the controller with an observation first"):
+        _ = controller.elapsed
+    for obs, shape in ((np.zeros(3, np.float32), ()), (np.zeros((2, 3), np.float32), (2,))):
+        controller.reset()
+        controller(obs, now=0.0)
+        assert np.all(controller.elapsed == 0.0)
+        controller(None, now=1.0)
+        for told in (controller.elapsed, controller.duration, controller.remaining, controller.option[..., 0]):
+            assert np.shape(told) == shape
+            assert np.isnan(told).all()
+        controller(obs, now=1.1)
+        assert np.all(controller.elapsed == 0.0)

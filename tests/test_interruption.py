@@ -284,3 +284,25 @@ def test_no_option_is_asked_about_where_nothing_interrupts(scripted_env):
     wrapper = OptionExecutionWrapper(scripted_env(), **SETTINGS)
     wrapper.reset()
     assert PLAYED not in wrapper.step([0.5, 1.0])[4]
+
+
+def test_an_environment_may_return_one_array_each_time():
+    """What an option was decided on is kept, and not where the environment writes."""
+
+    class One(gym.Env):
+        dt = 0.1
+        observation_space = spaces.Box(-9.0, 9.0, (1,), np.float32)
+        action_space = spaces.Box(-1.0, 1.0, (1,), np.float32)
+
+        def reset(self, *, seed=None, options=None):
+            self.obs = np.zeros(1, np.float32)
+            return self.obs, {}
+
+        def step(self, action):
+            self.obs += 0.1
+            return self.obs, 0.0, False, False, {}
+
+    env = RealTimeOptionWrapper(One(), n_rbf=1, d_max=1.0, interrupt=lambda first, seen, elapsed: seen[0] - first[0] > 0.35)
+    env.reset()
+    for _ in range(2):
+        assert env.step([0.0, 1.0])[4]["option"]["n_steps"] == 4

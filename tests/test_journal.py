@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from sb3_ctco.realtime import JournalError, JournalReader, JournalWriter, repair_journal
-from sb3_ctco.realtime.journal import segments
+from sb3_ctco.realtime.journal import check_meaning, segments
 
 MEANING = {"options": {"d_max": 1.0}}
 
@@ -294,3 +294,17 @@ def test_a_full_disk_is_an_error_and_what_was_written_stays(tmp_path):
     assert repair_journal(tmp_path) == 0, "the part that was written is gone"
     write(tmp_path, [5])
     assert read(tmp_path) == [4, 5]
+
+
+@pytest.mark.parametrize("left", [b"", b"\0" * 200])
+def test_a_segment_that_a_power_cut_left_empty_is_put_aside(tmp_path, caplog, left):
+    write(tmp_path, [3, 4])
+    path = tmp_path / "000007.journal"
+    path.write_bytes(left)
+    with caplog.at_level(logging.WARNING, logger="sb3_ctco.realtime.journal"):
+        assert repair_journal(tmp_path) == len(left)
+    assert "was empty: it is put aside as" in caplog.text
+    assert path.with_name("000007.journal.damaged").read_bytes() == left
+    check_meaning(tmp_path, MEANING)
+    write(tmp_path, [5])
+    assert read(tmp_path) == [3, 4, 5]

@@ -394,3 +394,35 @@ def test_the_safe_action_ends_an_option_in_the_plain_wrapper_too():
     *_, info = env.step([0.5, 1.0])
     assert "taken_over" not in info
     assert info["option"]["n_steps"] == 10
+
+
+def test_an_observation_grows_old_while_somebody_decides():
+    """0.2 s is as old as it may be: after 0.15 s of thinking it is acted on, after 60 s it is not, and the next one is."""
+    clock, machine = Clock(), Machine()
+    env = RealTimeWrapper(machine, clock=clock, safety=Safety(stale_after=0.2, **UNLIMITED))
+    env.reset()
+    for thinking in (0.0, 0.15, 60.0, 0.0):
+        clock.time += thinking
+        env.step(np.array([0.5]))
+    assert machine.commands == [0.5, 0.5, 0.0, 0.5]
+    clock.time = 0.0  # a clock that was set back: nobody knows how old it is, and it is not older
+    env.step(np.array([0.5]))
+    assert machine.commands[-1] == 0.5
+
+
+@pytest.mark.parametrize(
+    ("limits", "start", "age"),
+    [
+        ({"max_slew": np.inf}, [0.0], 0.0),
+        ({"max_rate": np.inf, "max_slew": np.inf}, [0.0], 0.0),
+        ({}, [np.nan], 0.0),
+        ({}, None, np.nan),
+    ],
+)
+def test_a_guard_never_sends_nan(limits, start, age):
+    guard = Guard(Safety(**limits), -np.ones(1), np.ones(1))
+    guard.start(start)
+    sent = [guard.command(np.array([0.5]), 0.1, age).item() for _ in range(3)]
+    assert np.isfinite(sent).all()
+    assert guard.is_safe_action == np.isnan(age)
+    assert sent[-1] == (0.0 if guard.is_safe_action else 0.5)

@@ -988,3 +988,64 @@ def test_a_preset_does_not_say_what_the_study_says(name, tmp_path):
     file.write_text(yaml.safe_dump(preset))
     with pytest.raises(ValueError, match=rf"ctco \(small\) has no arguments \['{name}'\]"):
         agents.constructor_arguments(load_preset(str(file)).select()[0])
+
+
+def test_a_run_in_two_sources_is_one_run(tmp_path):
+    file = write_csv(tmp_path / "one.csv", synthetic(1))
+    shutil.copy(file, tmp_path / "two.csv")
+    plots.plot([file, tmp_path / "two.csv"], tmp_path / "figures")
+    assert "; 1 seed; " in (tmp_path / "figures" / "table.md").read_text()
+    other = write_csv(tmp_path / "other.csv", [{**record, "fingerprint": "00000000"} for record in synthetic(1)])
+    with pytest.raises(ValueError, match="with other settings"):
+        plots.plot([file, other], tmp_path / "figures")
+    longer = [{**record, "preset": "learning", "task_seconds": 6000.0} for record in synthetic(1)]
+    longer = write_csv(tmp_path / "longer.csv", longer)
+    with pytest.raises(ValueError, match="preset learning with 6000 s of task time, and preset quick has 2400 s"):
+        plots.plot([file, longer], tmp_path / "figures")
+    file.write_text(file.read_text()[:-40])
+    with pytest.raises(ValueError, match=r"one.csv, line \d+, is damaged or cut off"):
+        read_records(file)
+
+
+def test_curves_of_episodes_that_end_at_other_times_have_a_mean():
+    """0 at 0 s and 10 at 10 s; 0 at 5 s and 20 at 15 s: at 5 s the mean of 5 and 0, at 10 s that of 10 and 10."""
+    together = plots._together([[(0.0, 0.0), (10.0, 10.0)], [(5.0, 0.0), (15.0, 20.0)]])
+    assert together == {0.0: [0.0], 5.0: [5.0, 0.0], 10.0: [10.0, 10.0], 15.0: [20.0]}
+
+
+def test_a_legend_has_what_any_panel_has():
+    records = [record for record in synthetic() if (record["task"], record["algorithm"]) != ("point_mass", "sac")]
+    labels = [text.get_text() for text in plots.draw_metric(records, "discounted_return").legends[0].get_texts()]
+    assert "SAC (large)" in labels
+    assert len(labels) == len(set(labels))
+
+
+def test_interquartile_means_of_costs_stand_upright():
+    records = [{**record, "discounted_return": -1.0 - record["discounted_return"]} for record in synthetic()]
+    estimates = {name: plots.interquartile_means(records, name) for name in ("discounted_return", "greedy_return")}
+    low, high = plots.draw_interquartile_means(records, estimates).axes[0].get_ylim()
+    assert low < 0.0 <= high
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"learning_starts_seconds": "1m"}, "learning_starts_seconds='1m', which must be a number of at least 0"),
+        ({"learning_starts_seconds": None}, "learning_starts_seconds=None, which must be a number"),
+        ({"policy_kwargs": {"features_extractor_class": 5}}, "there is no features_extractor_class 5"),
+    ],
+)
+def test_arguments_that_cannot_be_right_are_named(changes, message, tmp_path):
+    preset = yaml.safe_load(Path(tiny(tmp_path)).read_text())
+    preset["algorithms"]["ctco"]["arguments"] |= changes
+    file = tmp_path / "other.yml"
+    file.write_text(yaml.safe_dump(preset))
+    with pytest.raises(ValueError, match=message):
+        agents.constructor_arguments(load_preset(str(file)).select()[0])
+
+
+def test_an_id_of_one_rate_has_episodes_as_long_as_it_says():
+    assert find_task("sb3_ctco/cheetah-run-50hz-v0").seconds_of_episode(50) == 10.0
+    assert find_task("Pendulum-v1").seconds_of_episode(20) == 10.0
+    with pytest.raises(ValueError, match=r"has rollout_seconds, whole episodes of a task that has no longest one"):
+        ALGORITHM_ROWS["dac_ppo"].arguments({"rollout_seconds": 40}, 0.05, 0.0, "dac_ppo (mine)")

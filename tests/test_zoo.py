@@ -212,3 +212,8 @@ def test_an_unknown_command_names_the_known_ones(capsys):
         cli(["learn"])
     error = capsys.readouterr().err
     assert all(command in error for command in ("train", "enjoy", "tune"))
+
+
+def test_a_search_that_has_no_space_is_refused():
+    with pytest.raises(SystemExit, match=r"hyperparameters are searched for .*ctco.*, not for figar_sac"):
+        main(["tune", "--algo", "figar_sac", "--env", "Pendulum-v1"])

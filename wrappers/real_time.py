@@ -135,7 +135,7 @@ class RealTimeWrapper(gym.Wrapper, RecordConstructorArgs):
         self.guard = None if safety is None else Guard(safety, space.low, space.high)
         #: Why the safe action is to be sent, whatever is decided; None if it is not. For whoever watches the loop
         self.alarm: str | None = None
-        self._observation_age = 0.0
+        self._observed_at = 0.0
         self._sent_at: float | None = None
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
@@ -144,7 +144,7 @@ class RealTimeWrapper(gym.Wrapper, RecordConstructorArgs):
         self.statistics = TickStatistics()
         self._due = None
         obs, info = reset_env(self.env, seed, options)
-        self._observation_age, self._sent_at = 0.0, None
+        self._observed_at, self._sent_at = self.clock.now(), None
         if self.guard is not None:
             self.guard.start(info.get(LAST_ACTION))
         return obs, info
@@ -166,7 +166,8 @@ class RealTimeWrapper(gym.Wrapper, RecordConstructorArgs):
         if self.guard is not None:
             seconds = self.dt if self._sent_at is None else min(now - self._sent_at, self.dt)
             self._sent_at = now
-            action = self.guard.command(action, seconds, self._observation_age, self.alarm)
+            # Whoever decides takes time as well, in which it grows older.
+            action = self.guard.command(action, seconds, now - self._observed_at, self.alarm)
             replaced = self.guard.is_safe_action
             self.statistics.safe_ticks += replaced
             self.total_statistics.safe_ticks += replaced
@@ -177,7 +178,7 @@ class RealTimeWrapper(gym.Wrapper, RecordConstructorArgs):
         else:
             obs, reward, terminated, truncated, info = self.env.step(action)
             self._wait()
-        self._observation_age = info.get("observation_age", 0.0)
+        self._observed_at = self.clock.now() - info.get("observation_age", 0.0)
         info = {**info, "real_time": {"lateness": lateness}}
         if self.guard is not None:
             info = {LAST_ACTION: action, **info}

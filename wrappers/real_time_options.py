@@ -141,7 +141,7 @@ class RealTimeOptionWrapper(OptionExecutionWrapper):
         result = super().reset(seed=seed, options=options)
         self._commands = []
         self._sent = list(self._box.actions(self._last_two))
-        self._decided_on = self._last_obs
+        self._decided_on = deepcopy(self._last_obs)
         return result
 
     def step(self, action: npt.ArrayLike) -> tuple[Any, SupportsFloat, bool, bool, dict[str, Any]]:
@@ -200,7 +200,8 @@ class RealTimeOptionWrapper(OptionExecutionWrapper):
                 result[4][ON_THE_WAY] = [*rest[4][ON_THE_WAY], *result[4][ON_THE_WAY]]
                 result = (result[0], [*rest[1], *result[1]], *result[2:])  # type: ignore[misc]
             over = result[2] or result[3] or result[4].get("interrupted", False)
-        self._decided_on = result[0]
+        # The environment may return the same array once more.
+        self._decided_on = deepcopy(result[0])
         self._played, self._commands = np.array(self._commands), []
         # A sub-option that was decided on after k steps of this time would play as this option does from its step k on.
         on_the_way, n_ran = result[4][ON_THE_WAY], len(np.asarray(result[1]))

@@ -79,8 +79,10 @@ class TakeOverWrapper(gym.Wrapper, RecordConstructorArgs):
         """
         if self._actions:
             seen, actions = stack(self._observations), np.array(self._actions)
-            self.record(RecordedTrajectory(seen, actions, np.array(self._rewards), terminated, truncated, self.dt))
-        self._observations, self._actions, self._rewards = [], [], []
+            rewards = np.array(self._rewards)
+            # Forgotten first, so that what cannot be recorded is not handed over again.
+            self._observations, self._actions, self._rewards = [], [], []
+            self.record(RecordedTrajectory(seen, actions, rewards, terminated, truncated, self.dt))
 
     def close(self) -> None:
         """Hand over what was being recorded, and close the environment."""

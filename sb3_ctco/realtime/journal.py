@@ -135,8 +135,11 @@ class JournalWriter:
     def _begin_segment(self) -> BinaryIO:
         path = self.folder / f"{self._number:06d}.journal"
         unfinished = path.with_suffix(".unfinished")
-        unfinished.write_bytes(self._head)
-        # In one move, so that a reader never sees a part of a head.
+        # In one move, and on the disk before it, so that neither a reader nor a power cut leaves a part of a head.
+        with unfinished.open("wb") as file:
+            file.write(self._head)
+            file.flush()
+            os.fsync(file.fileno())
         os.replace(unfinished, path)
         self._counts[self._number] = 0
         self._delete_old_segments()
@@ -254,7 +257,8 @@ def check_meaning(folder: Path, meaning: Mapping[str, Any]) -> None:
 def repair_journal(folder: str | Path) -> int:
     """Drop what cannot be read of a journal that nobody writes to, so that all the rest can be read.
 
-    A damaged segment is kept as ``….journal.damaged``; what was dropped is logged as a warning.
+    A damaged segment is kept as ``….journal.damaged``, and so is one in which nothing stands, as a power cut leaves it; what
+    was dropped is logged as a warning.
 
     :param folder: of the journal
     :return: how many bytes were dropped
@@ -263,6 +267,12 @@ def repair_journal(folder: str | Path) -> int:
     dropped = 0
     for path in segments(Path(folder)).values():
         data = path.read_bytes()
+        if not data.strip(b"\0"):
+            damaged = _free_name(path)
+            path.rename(damaged)
+            dropped += len(data)
+            logger.warning("%s was empty: it is put aside as %s", path, damaged)
+            continue
         with path.open("rb") as file:
             _read_head(file)
             first = file.tell()

@@ -84,7 +84,7 @@ def send_zero(env: gym.Env) -> None:
 
 
 class AsynchronousTrainer(Generic[AlgorithmType]):
-    """Act in this process and learn in another one, for any off-policy algorithm of Stable-Baselines3.
+    """Act in this process and learn in another one, for any off-policy algorithm of continuous actions.
 
     Acting keeps the period of the environment by the wall clock and never waits for the learner. Every transition is
     written to ``folder/journal``, from which the learner fills its replay buffer: whatever was collected survives the
@@ -177,7 +177,7 @@ class AsynchronousTrainer(Generic[AlgorithmType]):
         self._demonstration_folder = self.folder / "demonstrations"
         self._demonstrations: JournalWriter | None = None
         self._take_over: TakeOverWrapper | None = None
-        if self._journal_folder.exists() and not resume:
+        if not resume and (self._journal_folder.exists() or segments(self._demonstration_folder)):
             raise FileExistsError(
                 f"{self.folder} holds the experience of an earlier run: pass resume=True to continue it, or another folder"
             )
@@ -189,11 +189,11 @@ class AsynchronousTrainer(Generic[AlgorithmType]):
         #: Counts late ticks; None without ``real_time``
         self.real_time: RealTimeWrapper | None = None
         if real_time:
-            env, self.real_time = _hold_period(env)
+            env, self.real_time = _hold_period(env, model)
         self._supervisor = _Supervisor(env)
         wrapped: gym.Env = self._supervisor
         if take_over is not None:
-            wrapped = self._take_over = TakeOverWrapper(wrapped, take_over, self._keep_demonstration)
+            wrapped = self._take_over = TakeOverWrapper(wrapped, take_over, self._keep_demonstration, _given_dt(model))
         # In real time also without any of that, so that a watchdog ends an option.
         if reactive or (real_time and isinstance(model, OptionOffPolicyAlgorithm)):
             assert isinstance(model, OptionOffPolicyAlgorithm)
@@ -215,9 +215,9 @@ class AsynchronousTrainer(Generic[AlgorithmType]):
         #: Age in s of the weights that each of them was made with
         self.weight_ages: deque[float] = deque(maxlen=_MAX_KEPT)
         if resume:
-            check_meaning(self._journal_folder, _meaning(model))
-            repair_journal(self._journal_folder)
-            repair_journal(self._demonstration_folder)
+            for journal in (self._journal_folder, self._demonstration_folder):
+                repair_journal(journal)
+                check_meaning(journal, _meaning(model))
             self._load_checkpoint()
             self._count_timesteps()
 
@@ -267,6 +267,8 @@ class AsynchronousTrainer(Generic[AlgorithmType]):
         try:
             with _sigterm_as_exit():
                 link.wait_until_ready()
+                if self.real_time is not None:
+                    self.real_time.alarm = None  # an earlier learner's
                 self._supervisor.check = lambda: self._look_at(link)
                 with _prompt_threads(), _scheduled(self.acting_priority):
                     self._act(in_between, journal, remaining, callbacks, log_interval, tb_log_name, progress_bar)
@@ -369,10 +371,14 @@ class AsynchronousTrainer(Generic[AlgorithmType]):
         option_env = unwrap_wrapper(self.model.env.envs[0], RealTimeOptionWrapper)  # type: ignore[union-attr]
         if isinstance(option_env, RealTimeOptionWrapper):
             option_env.abandon()
-        if self._take_over is not None:
-            self._take_over.hand_over()
-        if self._supervisor.has_commanded:
-            self.safe_stop(self.bare_env)
+        # Learning that goes on begins with a reset.
+        self.model._last_obs = None
+        try:
+            if self._supervisor.has_commanded:
+                self.safe_stop(self.bare_env)
+        finally:
+            if self._take_over is not None:
+                self._take_over.hand_over()
 
     def _load_checkpoint(self) -> None:
         path = self.folder / "model.zip"
@@ -393,7 +399,9 @@ class AsynchronousTrainer(Generic[AlgorithmType]):
             # A temperature may be fixed, and then be None in some algorithms.
             if isinstance(getattr(model, name), th.Tensor):
                 getattr(model, name).data.copy_(getattr(learned, name).data)
-        model._n_updates = learned._n_updates
+        for name in ("_n_updates", "_penalty_unit"):  # the latter is CTCO's
+            if hasattr(learned, name):
+                setattr(model, name, getattr(learned, name))
         unit = (learned.replay_buffer_kwargs or {}).get("reward_scale")
         if unit is not None:
             # The critics learned in this unit, which "auto" would find anew, in what is left in the journal.
@@ -414,18 +422,25 @@ class AsynchronousTrainer(Generic[AlgorithmType]):
         journal.close()
 
 
-def _hold_period(env: gym.Env) -> tuple[gym.Env, RealTimeWrapper]:
+def _given_dt(model: OffPolicyAlgorithm) -> float | None:
+    """The period that the user gave an algorithm of options, in s; None if the environment is to tell it."""
+    return model.dt if isinstance(model, OptionOffPolicyAlgorithm) and model._dt_was_given else None
+
+
+def _hold_period(env: gym.Env, model: OffPolicyAlgorithm) -> tuple[gym.Env, RealTimeWrapper]:
     """An environment with a RealTimeWrapper, and that one: directly around a machine, whose step has two halves."""
-    found = unwrap_wrapper(env, RealTimeWrapper)
+    found, dt = unwrap_wrapper(env, RealTimeWrapper), _given_dt(model)
     if isinstance(found, RealTimeWrapper):
+        if dt is not None and not math.isclose(found.dt, dt, rel_tol=1e-6):
+            raise ValueError(f"the environment's RealTimeWrapper has dt={found.dt}, the model has dt={dt}: give both the same")
         return env, found
     if env is env.unwrapped or not isinstance(env.unwrapped, SupportsSendReceive):
-        real_time = RealTimeWrapper(env)
+        real_time = RealTimeWrapper(env, dt)
         return real_time, real_time
     innermost: Any = env
     while innermost.env is not env.unwrapped:
         innermost = innermost.env
-    innermost.env = RealTimeWrapper(env.unwrapped)
+    innermost.env = RealTimeWrapper(env.unwrapped, dt)
     return env, innermost.env
 
 
@@ -437,6 +452,8 @@ def _check_model_and_env(model: Any, env: Any) -> None:
             f"pass one bare Gymnasium environment, not {env}: AsynchronousTrainer wraps it itself, with the settings of "
             "the model"
         )
+    if not isinstance(model.action_space, spaces.Box):
+        raise ValueError(f"AsynchronousTrainer needs continuous actions, not {model.action_space}")
     normalizer = model.get_vec_normalize_env()
     if normalizer is not None and normalizer.norm_obs:
         raise ValueError(
@@ -547,17 +564,17 @@ def _meaning(model: OffPolicyAlgorithm) -> dict[str, Any]:
     """What a model's transitions mean, by which another one may or may not learn from them."""
     space = model.observation_space
     leaves = space.spaces if isinstance(space, spaces.Dict) else {"": space}
-    box: Any = model.action_space
+    actions: Any = model.action_space
     options: dict[str, Any] | None = None
     if isinstance(model, OptionOffPolicyAlgorithm):
-        box = model.primitive_action_space
+        actions = model.primitive_action_space
         # A trajectory that is no name is a class, of which JSON keeps the name.
         arguments = model.option_space.arguments
         options = {name: value if isinstance(value, int | float | str) else str(value) for name, value in arguments.items()}
     return {
         "algorithm": type(model).__name__,
         "options": options,
-        "actions": {"low": box.low.tolist(), "high": box.high.tolist()} if isinstance(box, spaces.Box) else str(box),
+        "actions": {"low": actions.low.tolist(), "high": actions.high.tolist()},
         "observations": {name: [list(leaf.shape or ()), str(leaf.dtype)] for name, leaf in leaves.items()},
     }
 

@@ -22,10 +22,10 @@ def constructor_arguments(run: Run) -> dict[str, Any]:
     episode_seconds = find_task(run.task).seconds_of_episode(run.rate)
     # A copy, since Stable-Baselines3 writes into policy_kwargs, and the run's are what its record is known by.
     arguments = ALGORITHMS[run.algorithm].arguments(copy.deepcopy(run.arguments), run.dt, episode_seconds, where)
-    policy_kwargs = arguments.get("policy_kwargs", {})
+    policy_kwargs = arguments.get("policy_kwargs") or {}
     if "features_extractor_class" in policy_kwargs:
         name = policy_kwargs["features_extractor_class"]
-        extractor = pydoc.locate(name)
+        extractor = pydoc.locate(name) if isinstance(name, str) else None
         if extractor is None:
             raise ValueError(f"{where}: there is no features_extractor_class {name}; give its full name, module.Class")
         arguments["policy_kwargs"] = {**policy_kwargs, "features_extractor_class": extractor}

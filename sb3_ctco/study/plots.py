@@ -11,7 +11,15 @@ import numpy as np
 
 from sb3_ctco.options import DEFAULT_DISCOUNT_RATE
 from sb3_ctco.registry import ALGORITHMS, TASKS, find_task
-from sb3_ctco.study.records import CURVE_EPISODES, Record, key, paper_returns, read_curves, read_records
+from sb3_ctco.study.records import (
+    CURVE_EPISODES,
+    Record,
+    key,
+    paper_returns,
+    read_curves,
+    read_records,
+    refuse_other_fingerprint,
+)
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -76,8 +84,9 @@ def tasks_of(records: Sequence[Record]) -> list[str]:
 def interquartile_means(records: Sequence[Record], metric: str) -> Estimates:
     """Interquartile means over seeds and tasks with their 95 % intervals, from rliable.
 
-    Scores are returns times τ, that is fractions of the most that a reward of 1 a second can give. A rate needs at least
-    one seed that is complete in all tasks; its interval is that of a bootstrap over seeds within tasks, and nan for one.
+    Scores are returns times the paper's τ, 0.404/s, that is fractions of the most that a reward of 1 a second can give. A rate
+    needs at least one seed that is complete in all tasks; its interval is that of a bootstrap over seeds within tasks, and nan
+    for one.
     """
     from rliable.library import get_interval_estimates  # noqa: PLC0415
     from rliable.metrics import aggregate_iqm  # noqa: PLC0415
@@ -134,9 +143,7 @@ def draw_metric(records: Sequence[Record], metric: str) -> "Figure":
             _return_axis(ax, shown)
     axes[0][0].set_ylabel(METRICS[metric])
     seeds = _seeds(records)
-    _legend(
-        figure, axes[0][0], seeds if seeds == "1 seed" else f"mean and 95 % interval (Student's t) of {seeds}; a dot a seed"
-    )
+    _legend(figure, seeds if seeds == "1 seed" else f"mean and 95 % interval (Student's t) of {seeds}; a dot a seed")
     return figure
 
 
@@ -154,10 +161,10 @@ def draw_interquartile_means(records: Sequence[Record], estimates: dict[str, Est
             _line_with_intervals(ax, list(rates), means, low, high, line, lines)
         _rate_axis(ax, records)
         ax.set_title(METRICS[metric].split(",\n")[1])
-        ax.set_ylim(bottom=0.0)
-    axes[0][0].set_ylabel("interquartile mean\nof discounted return × τ")
+        ax.set_ylim(bottom=min(0.0, *(mean for rates in of_lines.values() for mean, _, _ in rates.values()), 0.0))
+    axes[0][0].set_ylabel("interquartile mean\nof discounted return × 0.404/s")
     seeds = _seeds(records)
-    _legend(figure, axes[0][0], seeds if seeds == "1 seed" else f"95 % intervals: stratified bootstrap over {seeds}")
+    _legend(figure, seeds if seeds == "1 seed" else f"95 % intervals: stratified bootstrap over {seeds}")
     return figure
 
 
@@ -170,16 +177,16 @@ def draw_learning_curves(points: Sequence[Record]) -> "Figure":
     """
     tasks, lines = tasks_of(points), lines_of(points)
     rates = sorted({_rate(point) for point in points})
-    values: dict[tuple[str, int, Line], dict[float, list[float]]] = defaultdict(lambda: defaultdict(list))
+    runs: dict[tuple[str, int, Line], dict[int, list[tuple[float, float]]]] = defaultdict(lambda: defaultdict(list))
     for point in points:
-        curve = values[point["task"], _rate(point), _line_of(point)]
-        curve[point["seconds"]].append(point["discounted_return"])
+        of_seeds = runs[point["task"], _rate(point), _line_of(point)]
+        of_seeds[point["seed"]].append((point["seconds"], point["discounted_return"]))
     figure, axes = _panels(len(rates), len(tasks))
     for row, rate in zip(axes, rates, strict=True):
         for ax, task in zip(row, tasks, strict=True):
             shown = [0.0]
             for line in lines:
-                curve = dict(sorted(values[task, rate, line].items()))
+                curve = _together(list(runs[task, rate, line].values()))
                 style, label = _style(line, lines)
                 minutes = np.array(list(curve)) / 60
                 means, half_widths = np.array([mean_and_interval(one) for one in curve.values()]).reshape(-1, 2).T
@@ -199,8 +206,19 @@ def draw_learning_curves(points: Sequence[Record]) -> "Figure":
     seeds = _seeds(list({key(point): point for point in points}.values()))
     episodes = f"mean of (up to) {CURVE_EPISODES} training episodes"
     interval = "" if seeds == "1 seed" else f"; mean of {seeds}, 95 % interval (Student's t) of 3 or more"
-    _legend(figure, axes[0][0], episodes + interval)
+    _legend(figure, episodes + interval)
     return figure
+
+
+def _together(curves: Sequence[Sequence[tuple[float, float]]]) -> dict[float, list[float]]:
+    """Runs' returns by task time: episodes that end early end at other times in each run, so that between points are lines."""
+    together: dict[float, list[float]] = {seconds: [] for seconds in sorted({at for curve in curves for at, _ in curve})}
+    for curve in curves:
+        seconds, returns = np.array(sorted(curve)).T
+        for at, values in together.items():
+            if seconds[0] <= at <= seconds[-1]:
+                values.append(float(np.interp(at, seconds, returns)))
+    return together
 
 
 def table(records: Sequence[Record], estimates: dict[str, Estimates]) -> str:
@@ -277,7 +295,7 @@ def plot(
 
     # Text as text, and the same bytes for the same records.
     mpl.rcParams.update({"svg.fonttype": "none", "svg.hashsalt": "sb3-ctco"})
-    everything = [record for source in sources for record in read_records(source)]
+    everything = _merged(sources)
     records = chosen(scores.with_equal_repeats(everything))
     if not records:
         raise ValueError(f"no record has an algorithm of {algorithms} and a setting of {settings}: {lines_of(everything)}")
@@ -294,7 +312,9 @@ def plot(
     if relative:
         figures["profiles"] = scores.draw_profiles(records, relative)
         figures["improvement"] = scores.draw_improvement(records, relative)
-    if points := chosen([point for source in sources for point in read_curves(source)]):
+    # A run that is in several sources is one run.
+    of_runs = {(*key(point), point["seconds"]): point for source in sources for point in read_curves(source)}
+    if points := chosen(list(of_runs.values())):
         figures["learning_curves"] = draw_learning_curves(points)
     written = []
     for name, figure in figures.items():
@@ -305,6 +325,26 @@ def plot(
     written.append(output / "table.md")
     written[-1].write_text(table(records, estimates) + scores.averaged_table(relative), encoding="utf-8")
     return written
+
+
+def _merged(sources: Sequence[Path]) -> list[Record]:
+    """The records of all sources, each run once.
+
+    :raises ValueError: if a run is there with different settings, or if runs of different lengths would make one mean
+    """
+    merged: dict[tuple[Any, ...], Record] = {}
+    lengths: dict[tuple[Any, ...], Record] = {}
+    for source in sources:
+        for record in read_records(source):
+            there = merged.setdefault(key(record), record)
+            refuse_other_fingerprint(there["fingerprint"], record["fingerprint"], key(record), source)
+            of_mean = lengths.setdefault((record["task"], _line_of(record), _rate(record)), record)
+            if of_mean["task_seconds"] != record["task_seconds"]:
+                raise ValueError(
+                    f"{source} has runs of preset {record['preset']} with {record['task_seconds']:g} s of task time, and "
+                    f"preset {of_mean['preset']} has {of_mean['task_seconds']:g} s: they make no mean, plot one of them"
+                )
+    return list(merged.values())
 
 
 def _rate(record: Record) -> int:
@@ -370,9 +410,12 @@ def _rate_axis(ax: "Axes", records: Sequence[Record]) -> None:
     ax.set_xlabel("interaction frequency [Hz]")
 
 
-def _legend(figure: "Figure", ax: "Axes", title: str) -> None:
-    handles, labels = ax.get_legend_handles_labels()
-    figure.legend(handles, labels, title=title, loc="outside lower center", ncols=4, fontsize="small", title_fontsize="small")
+def _legend(figure: "Figure", title: str) -> None:
+    """Each label once, whichever panels it is in."""
+    shown = [zip(*ax.get_legend_handles_labels(), strict=True) for ax in figure.axes if ax.get_visible()]
+    entries = {label: handle for of_panel in shown for handle, label in of_panel}
+    place: dict[str, Any] = {"loc": "outside lower center", "ncols": 4, "fontsize": "small", "title_fontsize": "small"}
+    figure.legend(list(entries.values()), list(entries), title=title, **place)
 
 
 def _row(*cells: str) -> str:

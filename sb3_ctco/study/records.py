@@ -104,7 +104,7 @@ def collect(folders: Sequence[Path], into: Path) -> tuple[int, int]:
         for record in read_records(folder):
             name = key(record)
             there = merged.setdefault(name, record)
-            _refuse_other_fingerprint(there["fingerprint"], record["fingerprint"], name, into)
+            refuse_other_fingerprint(there["fingerprint"], record["fingerprint"], name, into)
             curves.setdefault(name, of_folder.get(name, []))
     into.parent.mkdir(parents=True, exist_ok=True)
     points = (point for name in sorted(curves) for point in curves[name])
@@ -141,7 +141,13 @@ def _read_csv(file: Path, columns: dict[str, type]) -> list[Record]:
         missing = [name for name in columns if name not in (reader.fieldnames or ())]
         if missing:
             raise ValueError(f"{file} lacks the columns {missing}: pass a file that `sb3-ctco study collect` wrote")
-        return [{name: kind(row[name]) for name, kind in columns.items()} for row in reader]
+        rows = []
+        for number, row in enumerate(reader, start=2):
+            try:
+                rows.append({name: kind(row[name]) for name, kind in columns.items()})
+            except (TypeError, ValueError) as error:
+                raise ValueError(f"{file}, line {number}, is damaged or cut off ({error}): {row}") from None
+        return rows
 
 
 def _as_csv(columns: dict[str, type], rows: Iterable[Record]) -> str:
@@ -164,11 +170,12 @@ def without_recorded(runs: Iterable[Run], file: Path) -> list[Run]:
         if found is None:
             left.append(run)
         else:
-            _refuse_other_fingerprint(found, run.fingerprint, key_of_run(run), file)
+            refuse_other_fingerprint(found, run.fingerprint, key_of_run(run), file)
     return left
 
 
-def _refuse_other_fingerprint(there: str, here: str, name: tuple[Any, ...], file: Path) -> None:
+def refuse_other_fingerprint(there: str, here: str, name: tuple[Any, ...], file: Path) -> None:
+    """Raise ``ValueError`` if two records of one run were made with different settings."""
     if there != here:
         raise ValueError(
             f"{file} has run {name} with other settings (fingerprint {there}, not {here}): remove its row, or use another file"

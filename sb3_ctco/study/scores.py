@@ -13,6 +13,7 @@ from sb3_ctco.study.plots import (
     _apart,
     _interval_cell,
     _legend,
+    _line_of,
     _panels,
     _rate,
     _rate_axis,
@@ -69,7 +70,7 @@ def relative_scores(records: Sequence[Record], metric: str) -> dict[Line, dict[i
     }
     # What costs have no share of what can be had.
     tasks = [task for task in tasks if best[task] > 0]
-    values = {(_line(record), _rate(record), record["seed"], record["task"]): record[metric] for record in records}
+    values = {(_line_of(record), _rate(record), record["seed"], record["task"]): record[metric] for record in records}
     scores: dict[Line, dict[int, np.ndarray]] = {}
     for line in lines_of(records):
         for rate in sorted({_rate(record) for record in records}):
@@ -162,7 +163,7 @@ def draw_pareto(records: Sequence[Record], metric: str) -> "Figure":
         row[0].set_ylabel("discounted return")
     for ax in axes[-1]:
         ax.set_xlabel("decisions a second")
-    _legend(figure, axes[0][0], f"a point a setting; 95 % interval (Student's t) of {_seeds(records)}")
+    _legend(figure, f"a point a setting; 95 % interval (Student's t) of {_seeds(records)}")
     return figure
 
 
@@ -191,7 +192,7 @@ def draw_profiles(records: Sequence[Record], scores: dict[Line, dict[int, np.nda
         ax.set_xlabel("score x")
         ax.set_ylim(0.0, 1.02)
     axes[0][0].set_ylabel("share of runs above x")
-    _legend(figure, axes[0][0], f"score: return by the best mean at any rate; bands: 95 %, bootstrap over {_seeds(records)}")
+    _legend(figure, f"score: return by the best mean at any rate; bands: 95 %, bootstrap over {_seeds(records)}")
     return figure
 
 
@@ -220,7 +221,7 @@ def draw_improvement(records: Sequence[Record], scores: dict[Line, dict[int, np.
     right.set_xlim(left=0.0)
     right.set_title("score averaged over rates")
     right.set_xlabel("return by the best at any rate")
-    _legend(figure, left, f"interquartile means, 95 % intervals: stratified bootstrap over {_seeds(records)}")
+    _legend(figure, f"interquartile means, 95 % intervals: stratified bootstrap over {_seeds(records)}")
     return figure
 
 
@@ -231,7 +232,3 @@ def averaged_table(scores: dict[Line, dict[int, np.ndarray]]) -> str:
         rows.append(_row(ALGORITHMS[algorithm].label, setting, _interval_cell(estimate)))
     caption = "Interquartile mean, over tasks and seeds, of the mean over rates of return by the best mean return at any rate."
     return "\n".join(["\n## Averaged over rates\n", caption, "", *rows, ""])
-
-
-def _line(record: Record) -> Line:
-    return record["algorithm"], record["setting"]
