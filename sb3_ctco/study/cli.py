@@ -73,7 +73,7 @@ def _parser() -> argparse.ArgumentParser:
     plot.add_argument("sources", type=Path, nargs="+", metavar="source", help="a study's folder, or a file of `collect`")
     plot.add_argument("--output", type=Path, metavar="DIR", help="SOURCE/figures by default, or figures beside the file")
     plot.add_argument("--algorithms", nargs="+", help="only these")
-    plot.add_argument("--settings", nargs="+", help="only these; best is the best action repeat")
+    plot.add_argument("--settings", nargs="+", help="only these, but for the figure pareto; best is the best action repeat")
     plot.set_defaults(call=_plot)
     return parser
 
