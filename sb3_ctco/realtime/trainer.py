@@ -405,7 +405,7 @@ class AsynchronousTrainer(Generic[AlgorithmType]):
         unit = (learned.replay_buffer_kwargs or {}).get("reward_scale")
         if unit is not None:
             # The critics learned in this unit, which "auto" would find anew, in what is left in the journal.
-            given = model.replay_buffer_kwargs["reward_scale"]
+            given = model.replay_buffer_kwargs.get("reward_scale", 1.0)
             if given not in ("auto", unit):
                 raise ValueError(
                     f"{path} was learned with reward_scale={unit}, not {given}: pass that, or move the file away to learn "
