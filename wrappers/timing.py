@@ -3,28 +3,21 @@
 from typing import Any
 
 import gymnasium as gym
-from stable_baselines3.common.env_util import unwrap_wrapper
 
 
 def find_dt(env: gym.Env, required_by: str | None = None) -> Any:
     """The interaction period of an environment, in s, from what it says of itself.
 
-    Looked for, in this order: that of a :class:`~sb3_ctco.wrappers.RealTimeWrapper`, ``env.unwrapped.dt``,
-    dm_control's ``control_timestep()``, ``1/metadata["render_fps"]``.
+    Looked for, in this order: ``dt`` of the outermost layer that has it (a :class:`~sb3_ctco.wrappers.RealTimeWrapper`, or the
+    environment itself), dm_control's ``control_timestep()``, ``1/metadata["render_fps"]``.
 
     :param required_by: names who needs it, in the error if the environment does not tell
     :return: the period in s, or None if the environment does not tell and nobody needs it
     :raises ValueError: if somebody needs it
     """
-    from sb3_ctco.wrappers.real_time import RealTimeWrapper  # noqa: PLC0415 (which looks here for its own)
-
-    clock = unwrap_wrapper(env, RealTimeWrapper)
-    if isinstance(clock, RealTimeWrapper):
-        return clock.dt
-    base = env.unwrapped
-    dt = getattr(base, "dt", None)
+    dt = env.get_wrapper_attr("dt") if env.has_wrapper_attr("dt") else None
     if dt is None:
-        control_timestep = getattr(base, "control_timestep", None)
+        control_timestep = getattr(env.unwrapped, "control_timestep", None)
         dt = control_timestep() if callable(control_timestep) else None
     if dt is None:
         render_fps = (env.metadata or {}).get("render_fps")

@@ -320,11 +320,7 @@ class OptionOffPolicyAlgorithm(OffPolicyAlgorithm):
         if "replay_buffer_kwargs" in kwargs:
             given = kwargs["replay_buffer_kwargs"] or {}
             unit = saved.get("replay_buffer_kwargs", {}).get("reward_scale", 1.0)
-            if given.get("reward_scale", "auto") not in ("auto", unit):
-                raise ValueError(
-                    f"reward_scale={given['reward_scale']} cannot be changed while loading: the file's critics learned with "
-                    f"reward_scale={unit}. Leave it out, or make a new model"
-                )
+            _check_unit(given.get("reward_scale", "auto"), unit)
             kwargs["replay_buffer_kwargs"] = {**given, "reward_scale": unit}
         # Of two that say the same in different ways, the one that is given holds.
         if "gradient_steps" in kwargs:
@@ -446,6 +442,19 @@ class OptionOffPolicyAlgorithm(OffPolicyAlgorithm):
                 )
         buffer.reward_scale = self.replay_buffer_kwargs["reward_scale"]
         self._tell_buffer()
+
+    def go_on_from(self, learned: "OptionOffPolicyAlgorithm") -> None:
+        """Take over what another model of this algorithm found in what it saw, beside what networks and optimizers hold.
+
+        That is the unit of its critics' values, which ``"auto"`` would find anew.
+
+        :raises ValueError: if this model was given another unit
+        """
+        unit = learned.replay_buffer_kwargs["reward_scale"]
+        _check_unit(self.replay_buffer_kwargs["reward_scale"], unit)
+        self.replay_buffer_kwargs["reward_scale"] = unit
+        assert isinstance(self.replay_buffer, OptionReplayBuffer | DictOptionReplayBuffer)
+        self.replay_buffer.reward_scale = unit
 
     def _init_callback(self, callback: MaybeCallback, progress_bar: bool = False) -> BaseCallback:
         if isinstance(callback, list):
@@ -576,6 +585,14 @@ class OptionOffPolicyAlgorithm(OffPolicyAlgorithm):
         """
         options, state = super().predict(observation, state, episode_start, deterministic)
         return options.view(OptionArray), state
+
+
+def _check_unit(given: float | str, unit: float | str) -> None:
+    if given not in ("auto", unit):
+        raise ValueError(
+            f"reward_scale={given} cannot be changed while loading: the file's critics learned with reward_scale={unit}. "
+            "Leave it out, or make a new model"
+        )
 
 
 def _available_memory() -> int | None:

@@ -15,6 +15,7 @@ from torch import nn
 
 from sb3_ctco.common.buffers import DictOptionReplayBuffer, OptionReplayBuffer
 from sb3_ctco.common.losses import ENTROPY_REFERENCES, EntropyReference, actor_loss, critic_target, log_reference_density
+from sb3_ctco.common.option_algorithm import OptionOffPolicyAlgorithm
 from sb3_ctco.common.soft_actor_critic import SoftOptionActorCritic
 from sb3_ctco.ctco.canonical import CanonicalOptions
 from sb3_ctco.ctco.fast_update import FastUpdate
@@ -302,6 +303,15 @@ class CTCO(SoftOptionActorCritic):
     def _after_load(self) -> None:
         super()._after_load()
         vars(self).pop("duration_target_entropy", None)
+
+    def go_on_from(self, learned: OptionOffPolicyAlgorithm) -> None:
+        """Take over the unit of the critics' values, and that of a relative β_h.
+
+        :raises ValueError: if this model was given another unit of values
+        """
+        super().go_on_from(learned)
+        assert isinstance(learned, CTCO)
+        self._penalty_unit = learned._penalty_unit
 
     def _networks_and_targets(self) -> list[tuple[nn.Module, nn.Module]]:
         return [*super()._networks_and_targets(), (self.actor, self.actor_target)]

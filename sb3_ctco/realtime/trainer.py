@@ -389,6 +389,8 @@ class AsynchronousTrainer(Generic[AlgorithmType]):
         model = self.model
         try:
             learned = type(model).load(path, device=model.device)
+            if isinstance(model, OptionOffPolicyAlgorithm):
+                model.go_on_from(learned)  # type: ignore[arg-type]
             model.set_parameters(learned.get_parameters(), device=model.device)  # type: ignore[arg-type]
         except Exception as error:  # a damaged file fails in as many ways as it has parts
             raise ValueError(
@@ -399,19 +401,7 @@ class AsynchronousTrainer(Generic[AlgorithmType]):
             # A temperature may be fixed, and then be None in some algorithms.
             if isinstance(getattr(model, name), th.Tensor):
                 getattr(model, name).data.copy_(getattr(learned, name).data)
-        for name in ("_n_updates", "_penalty_unit"):  # the latter is CTCO's
-            if hasattr(learned, name):
-                setattr(model, name, getattr(learned, name))
-        unit = (learned.replay_buffer_kwargs or {}).get("reward_scale")
-        if unit is not None:
-            # The critics learned in this unit, which "auto" would find anew, in what is left in the journal.
-            given = model.replay_buffer_kwargs.get("reward_scale", 1.0)
-            if given not in ("auto", unit):
-                raise ValueError(
-                    f"{path} was learned with reward_scale={unit}, not {given}: pass that, or move the file away to learn "
-                    "anew from what was collected"
-                )
-            model.replay_buffer_kwargs["reward_scale"] = model.replay_buffer.reward_scale = unit  # type: ignore[union-attr]
+        model._n_updates = learned._n_updates
 
     def _count_timesteps(self) -> None:
         if not segments(self._journal_folder):
