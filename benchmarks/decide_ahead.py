@@ -3,7 +3,7 @@
     python benchmarks/decide_ahead.py
 
 CTCO learns at 50 Hz with the next option decided on at the end of the one that plays, or some time before; each policy is
-then played greedily with each of these times. Without sub-options, which are not possible here.
+then played greedily with each of these times. Without sub-options.
 """
 
 import argparse

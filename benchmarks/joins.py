@@ -24,7 +24,7 @@ import torch as th
 
 from sb3_ctco import CTCO
 from sb3_ctco.evaluation import largest_jump, mean_absolute_jerk
-from sb3_ctco.options import discount
+from sb3_ctco.options import ActionBox, discount
 from sb3_ctco.study.agents import make_eval_env
 from sb3_ctco.study.grid import Run
 from sb3_ctco.study.runs import RECORD, SETTINGS
@@ -41,6 +41,7 @@ def play(run: Run, model: CTCO, n_episodes: int = 1) -> Iterable[tuple[float, np
     env = make_eval_env(run, model)
     space = model.primitive_action_space
     assert space is not None
+    box = ActionBox(space.low, space.high)
     for _ in range(n_episodes):
         obs, done = env.reset(), False
         value, actions, begins = 0.0, [], [0]
@@ -48,10 +49,9 @@ def play(run: Run, model: CTCO, n_episodes: int = 1) -> Iterable[tuple[float, np
             obs, _, (done,), (info,) = env.step(model.predict(obs, deterministic=True)[0])  # type: ignore[arg-type, misc]
             option = info["option"]
             value += float(discount(begins[-1] * run.dt, model.discount_rate)) * option["integrated_reward"]
-            actions.append(env.get_attr("played")[0].reshape(option["n_steps"], -1))
+            actions.append(box.normalise(env.get_attr("played")[0]))
             begins.append(begins[-1] + option["n_steps"])
-        low, high = space.low.ravel(), space.high.ravel()
-        yield value, 2.0 * (np.concatenate(actions) - low) / (high - low) - 1.0, np.array(begins[:-1])
+        yield value, np.concatenate(actions), np.array(begins[:-1])
     env.close()
 
 
@@ -84,7 +84,7 @@ def table(args: argparse.Namespace) -> None:
 
 
 def figure(args: argparse.Namespace) -> None:
-    import matplotlib.pyplot as plt  # noqa: PLC0415
+    import matplotlib.pyplot as plt
 
     folders = [args.folder / f"{args.task}-ctco_{setting}-{args.rate}hz-seed{args.seed}" for setting in args.settings]
     _, panels = plt.subplots(

@@ -125,7 +125,7 @@ def measure(run: Run, folder: Path, episodes: int) -> Iterator[tuple[Any, ...]]:
 def draw(rows: list[dict[str, Any]], file: Path) -> None:
     """A row a task, a column a disturbance; mean over seeds, a thin line a seed."""
     mpl.use("Agg")
-    import matplotlib.pyplot as plt  # noqa: PLC0415
+    import matplotlib.pyplot as plt
 
     tasks = list(dict.fromkeys(row["task"] for row in rows))
     labels = {"rate": "control rate [Hz]", "jitter": "jitter, share of dt", "age": "age of the observation [ms]"}

@@ -15,7 +15,6 @@ import gymnasium as gym
 import numpy as np
 import torch as th
 
-import sb3_ctco  # noqa: F401 (registers the environment)
 from sb3_ctco import CTCO
 from sb3_ctco.evaluation import DiscountedReturnCallback, EpisodeStatistics, evaluate_discounted_return
 from sb3_ctco.realtime import AsynchronousTrainer
@@ -33,8 +32,6 @@ def make_model(env: gym.Env, rate: int, seed: int, **kwargs: Any) -> CTCO:
         buffer_size=120_000,
         batch_size=32,
         tau=0.01,
-        # From SAC's usual start, 1, a reward of 1 a second would be outweighed by entropy for most of a run.
-        ent_coef="auto_0.02",
         n_rbf=2,
         n_sub_options=4,
         d_max=1.0,

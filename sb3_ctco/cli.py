@@ -33,7 +33,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     if args.command == "study":
         sys.exit(study(args.flags))
     try:
-        from sb3_ctco.zoo import main as zoo  # noqa: PLC0415
+        from sb3_ctco.zoo import main as zoo
     except ImportError as error:
         sys.exit(f"sb3-ctco {args.command}: {error}")
     zoo([args.command, *args.flags])

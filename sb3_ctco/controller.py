@@ -521,8 +521,8 @@ def _as_policy(policy: Any, deterministic: bool, vec_normalize: Any) -> OptionPo
 def _algorithm_of(path: Path) -> "type[OptionOffPolicyAlgorithm]":
     """The class that saved a file, by a setting that only it has; nothing of the file is run to find out."""
     # Imported here, because an exported policy needs none of this.
-    from sb3_ctco.common.option_algorithm import OptionOffPolicyAlgorithm  # noqa: PLC0415
-    from sb3_ctco.registry import ALGORITHMS  # noqa: PLC0415
+    from sb3_ctco.common.option_algorithm import OptionOffPolicyAlgorithm
+    from sb3_ctco.registry import ALGORITHMS
 
     # As Stable-Baselines3 does: the ending may be left out.
     file = path if path.exists() else path.with_name(f"{path.name}.zip")

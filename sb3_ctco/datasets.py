@@ -44,7 +44,7 @@ def minari_trajectories(dataset: Any, dt: float) -> Iterator[RecordedTrajectory]
     """
     if isinstance(dataset, str):
         try:
-            import minari  # noqa: PLC0415
+            import minari
         except ImportError as error:
             raise ImportError("reading a Minari dataset needs minari: in a clone, pip install '.[minari]'") from error
         dataset = minari.load_dataset(dataset)
@@ -74,7 +74,7 @@ def lerobot_trajectories(
     :raises ValueError: if a column is missing, or is a video or an image, which are no numbers in these files
     """
     try:
-        from pyarrow import parquet  # noqa: PLC0415
+        from pyarrow import parquet
     except ImportError as error:
         raise ImportError("reading a LeRobot dataset needs pyarrow: in a clone, pip install '.[lerobot]'") from error
     info = Path(folder) / "meta" / "info.json"

@@ -12,7 +12,7 @@ from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.type_aliases import PolicyPredictor
 from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv
 
-from sb3_ctco.options import DEFAULT_DISCOUNT_RATE, discount, step_weight
+from sb3_ctco.options import DEFAULT_DISCOUNT_RATE, ActionBox, discount, step_weight
 from sb3_ctco.vec_env import PENDING
 
 
@@ -163,7 +163,7 @@ class _ActionRecorder:
         space = self.env.get_attr("primitive_action_space")[0] if self.is_option_env else self.env.action_space
         if not (isinstance(space, spaces.Box) and np.isfinite(space.low).all() and np.isfinite(space.high).all()):
             raise ValueError(f"smoothness is measured of actions in a Box with finite bounds, not in {space}")
-        self.low, self.range = space.low.astype(np.float64), space.high.astype(np.float64) - space.low
+        self.box = ActionBox(space.low, space.high)
 
     def step(self, actions: np.ndarray, dones: np.ndarray, infos: list[dict[str, Any]]) -> dict[int, np.ndarray]:
         """Account for one step of each environment.
@@ -175,10 +175,9 @@ class _ActionRecorder:
             if PENDING in info:
                 continue
             played = self.env.get_attr("played", indices=i)[0] if self.is_option_env else action[None]
-            self.actions[i].append(2.0 * (played - self.low) / self.range - 1.0)
+            self.actions[i].append(self.box.normalise(played))
             if done:
-                episode = np.concatenate(self.actions[i])
-                ended[i] = episode.reshape(len(episode), -1)
+                ended[i] = np.concatenate(self.actions[i])
                 self.actions[i] = []
         return ended
 

@@ -79,7 +79,7 @@ def export_onnx(
     if path.suffix != ".onnx":
         raise ValueError(f"path must end in .onnx, by which OptionController knows an exported policy, not be {path}")
     try:
-        import onnx  # noqa: PLC0415
+        import onnx
     except ImportError as error:
         raise ImportError(
             "exporting a policy needs onnx and onnxscript: in a clone of sb3-ctco, run pip install '.[onnx]'"

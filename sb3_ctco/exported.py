@@ -35,7 +35,7 @@ class OnnxPolicy:
 
     def __init__(self, path: str | Path, n_threads: int = 1):
         try:
-            import onnxruntime  # noqa: PLC0415
+            import onnxruntime
         except ImportError as error:
             raise ImportError(
                 "running an exported policy needs onnxruntime: in a clone of sb3-ctco, run pip install '.[onnx]'"

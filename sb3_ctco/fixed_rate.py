@@ -9,7 +9,7 @@ from gymnasium import spaces
 from gymnasium.utils import RecordConstructorArgs
 from stable_baselines3 import SAC
 from stable_baselines3.common.base_class import maybe_make_env
-from stable_baselines3.common.callbacks import BaseCallback, CallbackList
+from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.env_util import unwrap_wrapper
 from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.preprocessing import is_image_space
@@ -20,7 +20,7 @@ from stable_baselines3.sac.policies import LOG_STD_MAX, LOG_STD_MIN, SACPolicy
 from torch import nn
 
 from sb3_ctco.common.buffers import OptionReplayBuffer
-from sb3_ctco.common.callbacks import OptionProgressBarCallback, PrimitiveStepCallback
+from sb3_ctco.common.callbacks import as_callback, in_primitive_steps
 from sb3_ctco.options import OptionSpace, discount, discount_rate_from_gamma, step_weight
 from sb3_ctco.wrappers import OptionExecutionWrapper, RewardRateWrapper
 
@@ -106,12 +106,7 @@ class _SACOnOptions(SAC):
 
     def _init_callback(self, callback: MaybeCallback, progress_bar: bool = False) -> BaseCallback:
         self._n_seen = self.num_timesteps
-        counting: list[BaseCallback] = [PrimitiveStepCallback(super()._init_callback(callback))]
-        if progress_bar:
-            counting.append(OptionProgressBarCallback())
-        callbacks = CallbackList(counting)
-        callbacks.init_callback(self)
-        return callbacks
+        return super()._init_callback(in_primitive_steps(as_callback(callback), progress_bar))
 
     def train(self, gradient_steps: int, batch_size: int = 64) -> None:
         """The updates that are due, in place of a number a decision."""
@@ -291,7 +286,7 @@ def _priced_buffer(
 
 def _explore_with_pink_noise(model: SAC, n_decisions: int) -> None:
     try:
-        from pink import PinkNoiseDist  # noqa: PLC0415
+        from pink import PinkNoiseDist
     except ImportError as error:
         raise ImportError("pink_noise_seconds needs the package pink-noise-rl: run pip install pink-noise-rl") from error
     (action_dim,) = model.action_space.shape  # type: ignore[misc]

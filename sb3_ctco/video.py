@@ -62,7 +62,7 @@ class RecordEpisodes(gym.Wrapper, RecordConstructorArgs):
         result = reset_env(self.env, seed, options)
         self._n_steps = 0
         if self.progress:
-            from tqdm import tqdm  # noqa: PLC0415
+            from tqdm import tqdm
 
             limit = self.spec.max_episode_steps if self.spec is not None else None
             total = None if limit is None else 1 + math.floor(limit * self.dt * self.fps + 1e-6)
@@ -108,7 +108,7 @@ class RecordEpisodes(gym.Wrapper, RecordConstructorArgs):
         self._close_bar()
         if not self._frames:
             return
-        from moviepy.video.io.ImageSequenceClip import ImageSequenceClip  # noqa: PLC0415
+        from moviepy.video.io.ImageSequenceClip import ImageSequenceClip
 
         self.folder.mkdir(parents=True, exist_ok=True)
         file = self.folder / f"{self.name}-{len(self.files)}.mp4"

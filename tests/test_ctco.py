@@ -14,7 +14,8 @@ from torch.distributions import Normal
 
 from sb3_ctco import CTCO, DictOptionReplayBuffer, OptionExecutionWrapper, OptionReplayBuffer
 from sb3_ctco.common.losses import actor_loss, critic_loss, critic_target, log_reference_density
-from sb3_ctco.ctco.policies import CTCOPolicy, EnsembleLinear, squashed_log_prob
+from sb3_ctco.common.policies import EnsembleLinear, squashed_log_prob
+from sb3_ctco.ctco.policies import CTCOPolicy
 from sb3_ctco.options import DEFAULT_DISCOUNT_RATE, discount_rate_from_gamma, step_weight
 
 # Without sub-options, so that rows of the buffer are the decisions in their order.
@@ -748,7 +749,9 @@ def test_vec_normalize(random_walk_env):
 
 
 def test_action_noise(random_walk_env):
-    make(random_walk_env(), action_noise=NormalActionNoise(np.zeros(4), 0.1 * np.ones(4))).learn(60)
+    noise = NormalActionNoise(10 * np.ones(4), np.zeros(4))
+    model = make(random_walk_env(), action_noise=noise, learning_starts=0).learn(60)
+    np.testing.assert_array_equal(model.replay_buffer.actions[: model.replay_buffer.size()], 1.0)
 
 
 # --- bad input

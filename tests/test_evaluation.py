@@ -99,6 +99,16 @@ def test_the_callback_discounts_as_the_environment_does():
         model.learn(10, DiscountedReturnCallback(discount_rate=0.5))
 
 
+def test_an_entry_of_an_action_that_has_one_value_only_is_smooth():
+    class Env(CountingEnv):
+        action_space = spaces.Box(np.array([-1.0, 2.0], np.float32), np.array([1.0, 2.0], np.float32))
+
+    model = Scripted([1.0, 2.0], [-1.0, 2.0])
+    (episode,) = evaluate_discounted_return(model, Env(), 1, dt=DT, smoothness=True)
+    # Third differences of 1, −1, 1, … are 8 or −8, and 0 in the other entry.
+    assert episode.mean_absolute_jerk == pytest.approx(4 / DT**3)
+
+
 def test_jerk_by_hand():
     # a = t³ has the third derivative 6, and finite differences of a cubic are exact.
     t = np.arange(20)[:, None] * 0.1

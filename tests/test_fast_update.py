@@ -9,8 +9,8 @@ import pytest
 import torch as th
 
 from sb3_ctco import CTCO
+from sb3_ctco.common.policies import EnsembleLinear
 from sb3_ctco.ctco.fast_update import FastUpdate, PlainNetworks, _layers
-from sb3_ctco.ctco.policies import EnsembleLinear
 
 SMALL = {
     "policy_kwargs": {"net_arch": {"pi": [10, 12], "qf": [16, 8]}},

@@ -72,7 +72,9 @@ def test_the_default_for_images_says_how_much_it_plans(monkeypatch):
 
 def test_memory_of_this_machine():
     available = option_algorithm._available_memory()
-    assert available is None or 10**7 < available < 10**14
+    if not Path("/proc/meminfo").exists():
+        pytest.skip("read on Linux only")
+    assert 10**7 < available < 10**14
 
 
 @pytest.mark.parametrize("algorithm", [CTCO, FiGARSAC])

@@ -10,6 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from stable_baselines3 import SAC
 from stable_baselines3.common.buffers import ReplayBuffer
+from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.monitor import Monitor
 
@@ -185,6 +186,22 @@ def test_environments_that_are_wrapped_already(scripted_env):
         sac_at_rate(make_vec_env(scripted_env, 2), 0.1, **SMALL)
 
 
+def test_a_callback_is_made_ready_once(scripted_env):
+    class Counting(BaseCallback):
+        n = 0
+
+        def _init_callback(self):
+            self.n += 1
+
+        def _on_step(self):
+            return True
+
+    single, one_of_several = Counting(), Counting()
+    for callback in (single, [one_of_several]):
+        sac_at_rate(scripted_env(), 0.1, hold_seconds=0.2, **SMALL).learn(4, callback)
+    assert (single.n, one_of_several.n) == (1, 1)
+
+
 # --- fewer decisions, and other noise
 
 
@@ -297,7 +314,6 @@ def test_the_quick_policy_refuses_what_it_cannot_do(scripted_env):
 
 
 def test_pink_noise_stays_on_one_side_for_longer(scripted_env):
-    pytest.importorskip("pink", reason="pink-noise-rl is not installed")
     lasting = []
     for pink in (None, 10.0):
         model = sac_at_rate(scripted_env(dt=0.02), 0.02, pink_noise_seconds=pink, **SMALL)

@@ -194,7 +194,8 @@ def test_the_controller_ends_what_the_wrapper_ends(scripted_env, join, clock):
     settings = {**SETTINGS, "n_rbf": 2, "join": join}
     answers = (False, True, True, False, False, True)
     model = model_for(scripted_env(), **settings)
-    there, here = Scripted(0.3, *answers), Scripted(0.3, *answers)
+    # Two and a half steps are rounded up by both.
+    there, here = Scripted(0.25, *answers), Scripted(0.25, *answers)
     env = RealTimeOptionWrapper(scripted_env(), interrupt=there, **settings)
     obs, _ = env.reset()
     for _ in range(4):

@@ -332,7 +332,8 @@ class GoalWalk(gym.Env):
 
 def test_dictionaries(algorithm):
     model = make(algorithm, GoalWalk(), "MultiInputPolicy").learn(80)
-    evaluate_policy(model, model.get_env(), 2, warn=False)
+    _, lengths = evaluate_policy(model, model.get_env(), 2, return_episode_rewards=True)
+    assert lengths == [20, 20]
 
 
 def test_dictionaries_normalised_and_stacked(algorithm, tmp_path):

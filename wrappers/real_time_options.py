@@ -21,6 +21,7 @@ from sb3_ctco.options import (
     ValueInterrupt,
     shortest_steps,
     stack,
+    steps_in,
     with_last_action,
 )
 from sb3_ctco.wrappers.option_execution import ON_THE_WAY, OptionExecutionWrapper
@@ -111,7 +112,7 @@ class RealTimeOptionWrapper(OptionExecutionWrapper):
                     "a ValueInterrupt compares the rest of an option with the next one, which is decided on already with "
                     "decide_ahead: pass decide_ahead=0, or a rule about observations"
                 )
-            self._check_steps = max(1, round(interrupt.check_period / self.option_space.dt))
+            self._check_steps = steps_in(interrupt.check_period, self.option_space.dt)
 
     @classmethod
     def like(

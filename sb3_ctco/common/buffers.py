@@ -150,15 +150,15 @@ class _OptionStorage(ReplayBuffer):
                 f"{self.discount_rate}, by {discount(durations, self.discount_rate)}: give both the same discount_rate"
             )
         sub_options = {
-            i: _as_stored(infos[i]["sub_options"], _rows(obs, i), None if done[i] else _rows(next_obs, i))
+            i: _as_stored(infos[i]["sub_options"], rows_of(obs, i), None if done[i] else rows_of(next_obs, i))
             for i in options
             if "sub_options" in infos[i]
         }
         for i, option in options.items():
             position, row, info = self.pos, slice(i, i + 1), infos[i]
             super().add(
-                _rows(obs, row),  # type: ignore[arg-type]
-                _rows(next_obs, row),  # type: ignore[arg-type]
+                rows_of(obs, row),  # type: ignore[arg-type]
+                rows_of(next_obs, row),  # type: ignore[arg-type]
                 action[row],
                 reward[row],
                 done[row],
@@ -376,10 +376,6 @@ class _OptionStorage(ReplayBuffer):
 
     def _tensor(self, array: np.ndarray) -> th.Tensor:
         return th.from_numpy(array).to(self.device)
-
-
-def _rows(obs: Any, rows: slice | int) -> Any:
-    return {key: value[rows] for key, value in obs.items()} if isinstance(obs, dict) else obs[rows]
 
 
 def _as_stored(sub_options: SubOptions, first: Any, last: Any) -> SubOptions:

@@ -9,10 +9,12 @@ from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.callbacks import (
     BaseCallback,
     CallbackList,
+    ConvertCallback,
     EvalCallback,
     EventCallback,
     ProgressBarCallback,
 )
+from stable_baselines3.common.type_aliases import MaybeCallback
 
 from sb3_ctco.vec_env import PENDING
 
@@ -24,6 +26,18 @@ def eval_callbacks(callback: BaseCallback | None) -> Iterator[EvalCallback]:
     children = callback.callbacks if isinstance(callback, CallbackList) else []
     for child in [*children, callback.callback] if isinstance(callback, EventCallback) else children:
         yield from eval_callbacks(child)
+
+
+def as_callback(callback: MaybeCallback) -> BaseCallback | None:
+    """What ``learn`` accepts as one callback: a list of them, or a function, as Stable-Baselines3 takes it."""
+    if isinstance(callback, list):
+        return CallbackList(callback)
+    return callback if callback is None or isinstance(callback, BaseCallback) else ConvertCallback(callback)
+
+
+def in_primitive_steps(callback: BaseCallback | None, progress_bar: bool) -> CallbackList:
+    """A user's callback that sees primitive steps, and the progress bar that does."""
+    return CallbackList([PrimitiveStepCallback(callback), *([OptionProgressBarCallback()] if progress_bar else [])])
 
 
 class PrimitiveStepCallback(BaseCallback):

@@ -15,7 +15,7 @@ import torch as th
 from gymnasium import spaces
 from stable_baselines3.common.base_class import maybe_make_env
 from stable_baselines3.common.buffers import ReplayBuffer
-from stable_baselines3.common.callbacks import BaseCallback, CallbackList, ConvertCallback
+from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.env_util import unwrap_wrapper
 from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.noise import ActionNoise
@@ -42,7 +42,7 @@ from stable_baselines3.common.vec_env import (
 )
 
 from sb3_ctco.common.buffers import DictOptionReplayBuffer, OptionReplayBuffer
-from sb3_ctco.common.callbacks import OptionProgressBarCallback, PrimitiveStepCallback, eval_callbacks
+from sb3_ctco.common.callbacks import as_callback, eval_callbacks, in_primitive_steps
 from sb3_ctco.common.load_arguments import check_load_arguments
 from sb3_ctco.option_array import OptionArray
 from sb3_ctco.options import OPTIONS_OF_0_1_0, DurationScale, Join, OptionSpace, Trajectory, discount_rate_from_gamma
@@ -457,16 +457,10 @@ class OptionOffPolicyAlgorithm(OffPolicyAlgorithm):
         self.replay_buffer.reward_scale = unit
 
     def _init_callback(self, callback: MaybeCallback, progress_bar: bool = False) -> BaseCallback:
-        if isinstance(callback, list):
-            callback = CallbackList(callback)
-        elif callback is not None and not isinstance(callback, BaseCallback):
-            callback = ConvertCallback(callback)
+        callback = as_callback(callback)
         for evaluating in eval_callbacks(callback):
             evaluating.eval_env = self._as_eval_env(evaluating.eval_env)
-        callbacks: list[BaseCallback] = [PrimitiveStepCallback(callback)]
-        if progress_bar:
-            callbacks.append(OptionProgressBarCallback())
-        return super()._init_callback(CallbackList(callbacks))
+        return super()._init_callback(in_primitive_steps(callback, progress_bar))
 
     def learn(
         self: SelfOptionOffPolicyAlgorithm,

@@ -32,7 +32,7 @@ class CanonicalOptions:
     @staticmethod
     def makes_no_difference(space: OptionSpace) -> bool:
         """Whether even the shortest option has as many steps as weights; then the rounding of durations is small, too."""
-        return round(space.d_min / space.dt) >= space.trajectory.n_weights
+        return steps_in(space.d_min, space.dt) >= space.trajectory.n_weights
 
     def __call__(self, options: th.Tensor) -> th.Tensor:
         """Canonical options, differentiable by ω, and by d as if it were not rounded.

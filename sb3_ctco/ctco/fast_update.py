@@ -48,7 +48,7 @@ class FastUpdate:
     @staticmethod
     def refusal(model: CTCO) -> str | None:
         """Why ``model`` must be updated with autograd: what gradients were not worked out for; None if nothing is."""
-        from sb3_ctco.ctco.ctco import CTCO  # noqa: PLC0415
+        from sb3_ctco.ctco.ctco import CTCO
 
         actors, critics = (model.actor, model.actor_target), (model.critic, model.critic_target)
         networks = actors + critics

@@ -12,22 +12,10 @@ from sb3_ctco.common.policies import (
     LOG_STD_MAX,
     LOG_STD_MIN,
     EnsembleCritic,
-    EnsembleLinear,
     SoftOptionPolicy,
     SquashedActor,
     squashed_log_prob,
 )
-
-__all__ = [
-    "CTCOPolicy",
-    "CnnPolicy",
-    "EnsembleLinear",
-    "MlpPolicy",
-    "MultiInputPolicy",
-    "OptionActor",
-    "OptionCritic",
-    "squashed_log_prob",
-]
 
 
 class OptionActor(SquashedActor):

@@ -21,6 +21,7 @@ from sb3_ctco.dac_ppo.buffers import MDP, MDPS, DACDictRolloutBuffer, DACRollout
 from sb3_ctco.dac_ppo.policies import CnnPolicy, DACPolicy, MlpPolicy, MultiInputPolicy
 from sb3_ctco.options import discount_rate_from_gamma
 from sb3_ctco.wrappers import OptionExecutionWrapper
+from sb3_ctco.wrappers.timing import UNTOLD_DT, find_dt_of_all
 
 SelfDACPPO = TypeVar("SelfDACPPO", bound="DACPPO")
 
@@ -201,7 +202,7 @@ class DACPPO(OnPolicyAlgorithm):
             )
         if self._dt_was_given:
             return
-        found = _find_dt(env)
+        found = find_dt_of_all(env)
         if self.dt is not None and found is not None and not np.isclose(found, self.dt, rtol=1e-6, atol=0.0):
             raise ValueError(
                 f"the environment has dt={found}, DACPPO has dt={self.dt}: a policy is for one dt, so make the environment "
@@ -210,8 +211,8 @@ class DACPPO(OnPolicyAlgorithm):
         self.dt = found or self.dt
         if self.dt is None and (self.gamma_dt is not None or self.updates_per_second is not None):
             raise ValueError(
-                "the environment does not tell its interaction period (no unwrapped.dt, control_timestep() or "
-                "metadata['render_fps']): pass dt, in seconds, to DACPPO, or gamma_dt=None for a gamma and a gae_lambda a step"
+                f"the environment {UNTOLD_DT}: pass dt, in seconds, to DACPPO, or gamma_dt=None for a gamma and a gae_lambda "
+                "a step"
             )
 
     def set_env(self, env: GymEnv, force_reset: bool = True) -> None:
@@ -431,19 +432,3 @@ class DACPPO(OnPolicyAlgorithm):
             reset_num_timesteps=reset_num_timesteps,
             progress_bar=progress_bar,
         )
-
-
-def _find_dt(env: VecEnv) -> float | None:
-    """:func:`~sb3_ctco.wrappers.find_dt` for environments that may live in other processes."""
-    if env.has_attr("dt"):
-        periods = env.get_attr("dt")
-    elif env.has_attr("control_timestep"):
-        periods = env.env_method("control_timestep")
-    else:
-        rates = [(metadata or {}).get("render_fps") for metadata in env.get_attr("metadata")]
-        periods = [1.0 / float(rate) if rate else None for rate in rates]
-    if periods[0] is None:
-        return None
-    if not np.allclose(np.array(periods, dtype=float), float(periods[0]), rtol=1e-6, atol=0.0):
-        raise ValueError(f"the environments' interaction periods are {periods}: make all of them with the same dt")
-    return float(periods[0])

@@ -9,7 +9,7 @@ def mute_deprecated_attributes() -> None:
     For processes that belong to this package, such as its commands: MuJoCo has one handler of warnings per process.
     """
     try:
-        import mujoco  # noqa: PLC0415
+        import mujoco
     except ImportError:
         return
     mujoco.set_mju_user_warning(_pass_on)

@@ -1,7 +1,6 @@
 """The learning process: reads experience from the journal, updates, publishes weights."""
 
 import contextlib
-import dataclasses
 import logging
 import multiprocessing
 import os
@@ -25,7 +24,7 @@ from sb3_ctco.realtime.weights import SharedWeights
 
 logger = logging.getLogger(__name__)
 
-#: An update's share of a round is kept below this, so that a round can be stopped in time; in s
+#: How long a round of updates may take, so that it can be stopped in time; in s
 _ROUND_SECONDS = 0.1
 _LOG_SECONDS = 1.0
 
@@ -50,7 +49,7 @@ class Transition(NamedTuple):
         (info,) = self.infos
         kept: dict[str, Any] = {name: info[name] for name in ("TimeLimit.truncated", "option") if name in info}
         if "sub_options" in info:
-            kept["sub_options"] = _fields(info["sub_options"])
+            kept["sub_options"] = vars(info["sub_options"])
         return {**self._asdict(), "infos": kept}
 
     @classmethod
@@ -75,11 +74,6 @@ class Transition(NamedTuple):
     def n_rows(self) -> int:
         """Rows of a replay buffer that it fills."""
         return 1 + len(self.infos[0].get("sub_options", ()))
-
-
-def _fields(instance: Any) -> dict[str, Any]:
-    # Not dataclasses.asdict, which would copy every array.
-    return {field.name: getattr(instance, field.name) for field in dataclasses.fields(instance)}
 
 
 @dataclass(frozen=True)

@@ -22,7 +22,7 @@ import torch as th
 from gymnasium import spaces
 from gymnasium.error import ResetNeeded
 from stable_baselines3 import HerReplayBuffer
-from stable_baselines3.common.callbacks import BaseCallback, CallbackList, ConvertCallback
+from stable_baselines3.common.callbacks import BaseCallback, CallbackList
 from stable_baselines3.common.env_util import unwrap_wrapper
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.type_aliases import MaybeCallback, TrainFreq, TrainFrequencyUnit
@@ -31,6 +31,7 @@ from stable_baselines3.common.vec_env import VecEnv, VecEnvWrapper
 from stable_baselines3.common.vec_env.base_vec_env import VecEnvObs, VecEnvStepReturn
 
 from sb3_ctco.common.buffers import AddedTrajectory
+from sb3_ctco.common.callbacks import as_callback
 from sb3_ctco.common.option_algorithm import OptionOffPolicyAlgorithm
 from sb3_ctco.datasets import RecordedTrajectory
 from sb3_ctco.options import TAKEN_OVER, ValueInterrupt
@@ -63,7 +64,7 @@ AlgorithmType = TypeVar("AlgorithmType", bound=OffPolicyAlgorithm)
 _START_SECONDS = 120.0
 #: How long it may take to stop and save before it is killed, in s
 _STOP_SECONDS = 60.0
-#: How many decisions times are kept of
+#: How many decisions' times are kept
 _MAX_KEPT = 100_000
 
 
@@ -263,7 +264,8 @@ class AsynchronousTrainer(Generic[AlgorithmType]):
         learner_end.close()
         link = _Link(process, report, weights, model)
         in_between = _AsynchronousCallback(self, link)
-        callbacks = CallbackList([in_between, *_as_list(callback)])
+        given = as_callback(callback)
+        callbacks = CallbackList([in_between, *([] if given is None else [given])])
         try:
             with _sigterm_as_exit():
                 link.wait_until_ready()
@@ -512,12 +514,6 @@ def _check_folder(folder: Path) -> None:
             pass
     except OSError as error:
         raise OSError(f"experience cannot be kept in {folder} ({error}): pass a folder that can be written to") from error
-
-
-def _as_list(callback: MaybeCallback) -> list[BaseCallback]:
-    if callback is None or isinstance(callback, list):
-        return callback or []
-    return [callback if isinstance(callback, BaseCallback) else ConvertCallback(callback)]
 
 
 class _Supervisor(gym.Wrapper):

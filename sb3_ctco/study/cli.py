@@ -79,11 +79,11 @@ def _parser() -> argparse.ArgumentParser:
 
 
 def _run(args: argparse.Namespace) -> int:
-    from sb3_ctco.study.agents import constructor_arguments  # noqa: PLC0415
-    from sb3_ctco.study.engines import run_local, run_on_ray  # noqa: PLC0415
-    from sb3_ctco.study.grid import load_preset  # noqa: PLC0415
-    from sb3_ctco.study.records import without_recorded  # noqa: PLC0415
-    from sb3_ctco.study.runs import RECORD, plan  # noqa: PLC0415
+    from sb3_ctco.study.agents import constructor_arguments
+    from sb3_ctco.study.engines import run_local, run_on_ray
+    from sb3_ctco.study.grid import load_preset
+    from sb3_ctco.study.records import without_recorded
+    from sb3_ctco.study.runs import RECORD, plan
 
     if args.workers is not None and args.workers < 1:
         raise ValueError(f"--workers must be at least 1, not {args.workers}")
@@ -129,10 +129,10 @@ def _in_time(
     args: argparse.Namespace, left: "list[Run]", folder: Path, workers: int
 ) -> "tuple[list[Run], Callable[[Run], bool]]":
     """The runs that fit into ``--hours``, as is printed, and whether one still does when its turn comes."""
-    from sb3_ctco.study.records import read_records  # noqa: PLC0415
-    from sb3_ctco.study.runs import RECORD  # noqa: PLC0415
-    from sb3_ctco.study.schedule import costs, fit  # noqa: PLC0415
-    from sb3_ctco.study.status import clock  # noqa: PLC0415
+    from sb3_ctco.study.records import read_records
+    from sb3_ctco.study.runs import RECORD
+    from sb3_ctco.study.schedule import costs, fit
+    from sb3_ctco.study.status import clock
 
     files = [*args.costs, *([args.skip_records] if args.skip_records else [])]
     sources = [read_records(source) for source in ([folder] if any(folder.glob(f"*/{RECORD}")) else []) + files]
@@ -147,7 +147,7 @@ def _in_time(
 
 
 def _status(args: argparse.Namespace) -> int:
-    from sb3_ctco.study.status import read_status  # noqa: PLC0415
+    from sb3_ctco.study.status import read_status
 
     status = read_status(args.folder)
     print("\n".join([status.summary(), *status.details()]))
@@ -155,7 +155,7 @@ def _status(args: argparse.Namespace) -> int:
 
 
 def _collect(args: argparse.Namespace) -> int:
-    from sb3_ctco.study.records import collect  # noqa: PLC0415
+    from sb3_ctco.study.records import collect
 
     n_new, n_all = collect(args.folders, args.into)
     print(f"{n_new} new rows, {n_all} in {args.into}")
@@ -163,7 +163,7 @@ def _collect(args: argparse.Namespace) -> int:
 
 
 def _plot(args: argparse.Namespace) -> int:
-    from sb3_ctco.study.plots import plot  # noqa: PLC0415
+    from sb3_ctco.study.plots import plot
 
     first = args.sources[0]
     output = args.output or (first if first.is_dir() else first.parent) / "figures"
@@ -173,13 +173,13 @@ def _plot(args: argparse.Namespace) -> int:
 
 
 def _cpu_count() -> int:
-    import joblib  # noqa: PLC0415
+    import joblib
 
     return joblib.cpu_count()  # What the process may use, in a container or under taskset, too.
 
 
 def _say(text: str) -> None:
-    from tqdm import tqdm  # noqa: PLC0415
+    from tqdm import tqdm
 
     tqdm.write(text)
 
@@ -193,7 +193,7 @@ class _Progress:
     """
 
     def __init__(self, folder: Path, runs: "Sequence[Run]", workers: int):
-        from tqdm import tqdm  # noqa: PLC0415
+        from tqdm import tqdm
 
         self.folder, self.names, self.workers = folder, [run.name for run in runs], workers
         self.terminal = sys.stderr.isatty()
@@ -215,7 +215,7 @@ class _Progress:
             self._show()
 
     def _show(self) -> None:
-        from sb3_ctco.study.status import read_status  # noqa: PLC0415
+        from sb3_ctco.study.status import read_status
 
         status = read_status(self.folder, self.names)
         if self.terminal:

@@ -127,7 +127,7 @@ def run_on_ray(runs: Sequence[Run], folder: Path, workers: int, address: str | N
     """
     os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")
     try:
-        import ray  # noqa: PLC0415
+        import ray
     except ImportError as error:
         raise ImportError("--engine ray needs Ray: in a clone of sb3-ctco, run pip install '.[ray]'") from error
 

@@ -42,7 +42,7 @@ Estimates = dict[Line, dict[int, tuple[float, float, float]]]
 
 def mean_and_interval(values: Sequence[float]) -> tuple[float, float]:
     """Mean over seeds, and half the width of its 95 % interval (Student's t; nan for one seed)."""
-    from scipy.stats import t  # noqa: PLC0415
+    from scipy.stats import t
 
     n = len(values)
     half_width = float(t.ppf(0.975, n - 1)) * float(np.std(values, ddof=1)) / math.sqrt(n) if n > 1 else math.nan
@@ -88,8 +88,8 @@ def interquartile_means(records: Sequence[Record], metric: str) -> Estimates:
     needs at least one seed that is complete in all tasks; its interval is that of a bootstrap over seeds within tasks, and nan
     for one.
     """
-    from rliable.library import get_interval_estimates  # noqa: PLC0415
-    from rliable.metrics import aggregate_iqm  # noqa: PLC0415
+    from rliable.library import get_interval_estimates
+    from rliable.metrics import aggregate_iqm
 
     tasks = tasks_of(records)
     values = {(_line_of(record), _rate(record), record["seed"], record["task"]): record[metric] for record in records}
@@ -282,12 +282,12 @@ def plot(
     :return: the files written
     :raises ValueError: if nothing is left
     """
-    import matplotlib as mpl  # noqa: PLC0415
+    import matplotlib as mpl
 
     mpl.use("Agg")
-    import matplotlib.pyplot as plt  # noqa: PLC0415
+    import matplotlib.pyplot as plt
 
-    from sb3_ctco.study import scores  # noqa: PLC0415
+    from sb3_ctco.study import scores
 
     by = list(algorithms or ALGORITHMS)
 
@@ -364,7 +364,7 @@ def _line_of(record: Record) -> Line:
 
 
 def _panels(n_rows: int, n_columns: int) -> tuple["Figure", np.ndarray]:
-    import matplotlib.pyplot as plt  # noqa: PLC0415
+    import matplotlib.pyplot as plt
 
     size = (4.0 * n_columns, 2.6 * n_rows + 1.2)
     return plt.subplots(n_rows, n_columns, figsize=size, squeeze=False, layout="constrained")

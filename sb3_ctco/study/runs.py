@@ -144,12 +144,12 @@ def lock(path: Path, patience: float = 0.5) -> Iterator[bool]:
 def _flock(file: IO[str]) -> None:
     """Lock a file as a whole, or raise an ``OSError`` if another process has."""
     if sys.platform == "win32":
-        import msvcrt  # noqa: PLC0415
+        import msvcrt
 
         file.seek(0)
         msvcrt.locking(file.fileno(), msvcrt.LK_NBLCK, 1)
     else:
-        import fcntl  # noqa: PLC0415
+        import fcntl
 
         fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
 

@@ -87,7 +87,7 @@ def frequency_averaged(scores: dict[Line, dict[int, np.ndarray]]) -> dict[Line, 
 
     Of lines that have all rates; as many seeds as each rate has.
     """
-    from rliable.metrics import aggregate_iqm  # noqa: PLC0415
+    from rliable.metrics import aggregate_iqm
 
     rates = {rate for of_rates in scores.values() for rate in of_rates}
     averaged = {}
@@ -122,7 +122,7 @@ def _probability_of_improvement(one: np.ndarray, other: np.ndarray) -> float:
 
 def _estimate(function: Callable[..., float], *matrices: np.ndarray) -> tuple[float, float, float]:
     """An estimate with rliable's 95 % interval, by a bootstrap over seeds within tasks; nan for one seed."""
-    from rliable.library import get_interval_estimates  # noqa: PLC0415
+    from rliable.library import get_interval_estimates
 
     value = float(function(*matrices))
     if min(map(len, matrices)) < 2:
@@ -169,7 +169,7 @@ def draw_pareto(records: Sequence[Record], metric: str) -> "Figure":
 
 def draw_profiles(records: Sequence[Record], scores: dict[Line, dict[int, np.ndarray]]) -> "Figure":
     """Performance profiles: the share of runs, over tasks and seeds, whose score is above a threshold; a panel a rate."""
-    from rliable.library import create_performance_profile  # noqa: PLC0415
+    from rliable.library import create_performance_profile
 
     rates = sorted({rate for of_rates in scores.values() for rate in of_rates})
     lines = list(scores)

@@ -108,11 +108,11 @@ def _make_gl_context(width: int, height: int) -> Any:
         os.environ["MUJOCO_GL"] = backend
     try:
         if backend == "egl":
-            from mujoco.egl import GLContext  # noqa: PLC0415
+            from mujoco.egl import GLContext
         elif backend == "osmesa":
-            from mujoco.osmesa import GLContext  # noqa: PLC0415
+            from mujoco.osmesa import GLContext
         else:
-            from mujoco import GLContext  # noqa: PLC0415
+            from mujoco import GLContext
         return GLContext(width, height)
     except Exception as error:  # whatever the OpenGL bindings raise, it means that there is no OpenGL
         raise RuntimeError(_failure(backend or "OpenGL", error)) from error
