@@ -20,7 +20,7 @@ from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv, VecEnvWrapper
 SelfAlgorithm = TypeVar("SelfAlgorithm", bound=BaseAlgorithm)
 
 #: Attributes that Stable-Baselines3 saves, but that setting up a loaded model begins anew
-_BEGUN_ANEW = ("_last_options",)
+_BEGUN_ANEW = ("_last_options", "_durations_since_log", "_residuals_since_log")
 #: Attributes of VecEnvs that belong to where they are in, not to what they have seen
 _NOT_STATE = ("venv", "class_attributes")
 
@@ -47,6 +47,7 @@ def save_checkpoint(model: BaseAlgorithm, path: str | pathlib.Path) -> None:
     except (TypeError, AttributeError, pickle.PicklingError) as error:
         raise ValueError(f"the state of the environments cannot be saved: {error}") from error
     state = {
+        "algorithm": _name(type(model)),
         "model": archive.getvalue(),
         "attributes": {name: getattr(model, name) for name in _BEGUN_ANEW if hasattr(model, name)},
         "replay_buffer": getattr(model, "replay_buffer", None),
@@ -72,10 +73,13 @@ def load_checkpoint(
     :param path: of a file of :func:`save_checkpoint`
     :param env: made as the model's was; its single environments are replaced by those in the file
     :param device: to go on on
-    :raises ValueError: if ``env`` has other layers or another number of environments
+    :raises ValueError: if ``env`` has other layers or another number of environments, or the model is of another class
     """
     with pathlib.Path(path).open("rb") as file:
         state = pickle.load(file)
+    saved_by = state.get("algorithm", _name(algorithm))
+    if saved_by != _name(algorithm):
+        raise ValueError(f"{path} is a checkpoint of {saved_by}: load it with that class, not with {_name(algorithm)}")
     model = algorithm.load(io.BytesIO(state["model"]), env=env, device=device, force_reset=False)
     for name, value in state["attributes"].items():
         setattr(model, name, value)
@@ -95,6 +99,10 @@ def load_checkpoint(
         vars(layer).update(one["attributes"])
     _set_generators(model, vec_env, state["generators"])
     return model
+
+
+def _name(algorithm: type[BaseAlgorithm]) -> str:
+    return f"{algorithm.__module__}.{algorithm.__qualname__}"
 
 
 def _layers(env: VecEnv) -> Iterator[VecEnv]:

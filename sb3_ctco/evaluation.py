@@ -10,7 +10,7 @@ import numpy.typing as npt
 from gymnasium import spaces
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.type_aliases import PolicyPredictor
-from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv
+from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv, unwrap_vec_normalize
 
 from sb3_ctco.options import DEFAULT_DISCOUNT_RATE, ActionBox, discount, step_weight
 from sb3_ctco.vec_env import PENDING
@@ -108,6 +108,12 @@ def _find_discount_rate(env: VecEnv, given: float | None) -> float:
             "them: leave discount_rate out, or make the environments with the same"
         )
     return expected
+
+
+def _as_paid(env: VecEnv, rewards: np.ndarray) -> np.ndarray:
+    """The last step's rewards, before VecNormalize."""
+    normalizer = unwrap_vec_normalize(env)
+    return rewards if normalizer is None else normalizer.get_original_reward()
 
 
 @dataclass
@@ -219,7 +225,7 @@ def evaluate_discounted_return(
     while any(wanted):
         actions, state = model.predict(obs, state=state, episode_start=dones, deterministic=deterministic)  # type: ignore[arg-type]
         obs, rewards, dones, infos = env.step(actions)
-        ended = tracker.step(rewards, dones, infos)
+        ended = tracker.step(_as_paid(env, rewards), dones, infos)
         if recorder is not None:
             for i, played in recorder.step(actions, dones, infos).items():
                 episode = ended[i]
@@ -258,7 +264,7 @@ class DiscountedReturnCallback(BaseCallback):
     def _on_step(self) -> bool:
         infos = self.locals["infos"]
         if infos[0]:  # empty at the ticks between two decisions
-            ended = self._tracker.step(self.locals["rewards"], self.locals["dones"], infos)
+            ended = self._tracker.step(_as_paid(self.training_env, self.locals["rewards"]), self.locals["dones"], infos)
             if ended:
                 self.episodes += ended.values()
                 self.timesteps += [self.num_timesteps] * len(ended)

@@ -90,26 +90,74 @@ class QuickSACPolicy(SACPolicy):
             log_std = _affine(self.actor.log_std, x).clip(LOG_STD_MIN, LOG_STD_MAX)
             gaussian += np.exp(log_std) * th.randn(gaussian.shape).numpy()
         actions = self.unscale_action(np.tanh(gaussian))
-        return actions if observation.ndim > 1 else actions[0], state
+        return actions if observation.ndim > len(self.observation_space.shape) else actions[0], state  # type: ignore[arg-type]
 
 
 def _affine(layer: Any, x: np.ndarray) -> np.ndarray:
     return x @ layer.weight.detach().numpy().T + layer.bias.detach().numpy()
 
 
-class _SACOnOptions(SAC):
-    """SAC that counts primitive steps, and updates by them, although it decides once an option."""
+class FixedRateSAC(SAC):
+    """SAC as :func:`sac_at_rate` makes it: what its rewards and decisions mean is saved, and asked of every environment.
 
-    updates_per_step = 0.0
+    Its arguments are SAC's. A model that was saved goes on with ``FixedRateSAC.load``; ``SAC.load`` makes a stock SAC of it,
+    which counts decisions as steps and explores without pink noise.
+
+    :raises ValueError: for an environment that does not tell of time in ``info["option"]``, or not as the model's did
+    """
+
+    #: Where decisions take several steps: updates by these, in place of ``train_freq`` and ``gradient_steps``
+    updates_per_step: float | None = None
+    #: The ``PinkNoiseDist`` that the actor samples with
+    pink_noise: Any = None
+    #: What a decision means in the environment, and what its reward is multiplied by
+    option_space: OptionSpace | None = None
+    reward_scale: float | None = None
     _updates_due = 0.0
     _n_seen = 0
 
+    def _setup_model(self) -> None:
+        if self.env is not None:
+            self._check_env(self.env)
+        super()._setup_model()
+        if self.pink_noise is not None:
+            self.actor.action_dist = self.pink_noise
+
+    def set_env(self, env: GymEnv, force_reset: bool = True) -> None:
+        """Stable-Baselines3's ``set_env``, for an environment that is wrapped as the model's was."""
+        env = self._wrap_env(env, self.verbose)
+        self._check_env(env)
+        super().set_env(env, force_reset)
+
+    def _check_env(self, env: VecEnv) -> None:
+        if not env.has_attr("option_space"):
+            raise ValueError(
+                "the environment must be wrapped as sac_at_rate wraps it, in RewardRateWrapper(env, dt, discount_rate, "
+                "reward_scale), or by hold_actions: pass model.get_env(), or one that is made likewise"
+            )
+        (space, *_), scale = env.get_attr("option_space"), None
+        if env.has_attr("reward_scale"):
+            (scale, *_) = env.get_attr("reward_scale")
+        if self.option_space is not None:
+            differences = self.option_space.differences(space)
+            if scale is not None and self.reward_scale is not None and not np.isclose(scale, self.reward_scale, rtol=1e-6):
+                differences["reward_scale"] = self.reward_scale, scale
+            if differences:
+                found = ", ".join(f"{name}={there} in place of {here}" for name, (here, there) in differences.items())
+                raise ValueError(f"the environment is another one than this model learned in: it has {found}")
+        self.option_space, self.reward_scale = space, scale
+
     def _init_callback(self, callback: MaybeCallback, progress_bar: bool = False) -> BaseCallback:
         self._n_seen = self.num_timesteps
+        if self.updates_per_step is None:
+            return super()._init_callback(callback, progress_bar)
         return super()._init_callback(in_primitive_steps(as_callback(callback), progress_bar))
 
     def train(self, gradient_steps: int, batch_size: int = 64) -> None:
-        """The updates that are due, in place of a number a decision."""
+        """SAC's; where decisions take several steps, the updates that are due."""
+        if self.updates_per_step is None:
+            super().train(gradient_steps, batch_size)
+            return
         self._updates_due += self.updates_per_step * (self.num_timesteps - max(self._n_seen, self.learning_starts))
         self._n_seen = self.num_timesteps
         if self._updates_due >= 1:
@@ -160,7 +208,7 @@ def sac_at_rate(
     decision_price: float = 0.0,
     pink_noise_seconds: float | None = None,
     **kwargs: Any,
-) -> SAC:
+) -> FixedRateSAC:
     """A plain SAC that at every ``dt`` learns as often a second, for the same discounted return.
 
     Its discount factor is γ^(dt/γ_dt) = e^(−τ·dt), its reward is a rate held over a step
@@ -195,7 +243,7 @@ def sac_at_rate(
     :param pink_noise_seconds: explore with pink noise, in pieces of this length in s, usually an episode's; it is the
         ``PinkNoiseDist`` of the package ``pink-noise-rl``
     :param kwargs: SAC's further arguments
-    :return: a ``stable_baselines3.SAC``
+    :return: a ``stable_baselines3.SAC`` that knows its clock, see :class:`FixedRateSAC`
     :raises ValueError: for settings out of range, or that contradict the environment's
     :raises TypeError: if ``kwargs`` have what follows from the clock: ``train_freq``, ``gradient_steps`` or
         ``learning_starts``, or with ``hold_seconds`` a ``replay_buffer_class``
@@ -233,12 +281,12 @@ def sac_at_rate(
         env = _with_reward_rate(env, dt, discount_rate, reward_scale)
         n_envs = env.num_envs if isinstance(env, VecEnv) else 1
         train_freq, gradient_steps = update_schedule(updates_per_second * dt * n_envs)
-        model = SAC(policy, env, train_freq=train_freq, gradient_steps=gradient_steps, **clock, **kwargs)
+        model = FixedRateSAC(policy, env, train_freq=train_freq, gradient_steps=gradient_steps, **clock, **kwargs)
     else:
         # The buffer has the discount of each decision, so gamma is not used.
         kwargs |= _priced_buffer(kwargs, env, discount_rate, reward_scale, decision_price)
         env = hold_actions(env, hold_seconds, n_rbf, learned_duration, dt, discount_rate)
-        model = _SACOnOptions(policy, env, **clock, **kwargs)
+        model = FixedRateSAC(policy, env, **clock, **kwargs)
         model.updates_per_step = updates_per_second * dt
     if pink_noise_seconds is not None:
         _explore_with_pink_noise(model, round(pink_noise_seconds / (hold_seconds or dt)))
@@ -284,13 +332,14 @@ def _priced_buffer(
     return {"replay_buffer_class": _PricedReplayBuffer, "replay_buffer_kwargs": kwargs}
 
 
-def _explore_with_pink_noise(model: SAC, n_decisions: int) -> None:
+def _explore_with_pink_noise(model: FixedRateSAC, n_decisions: int) -> None:
     try:
         from pink import PinkNoiseDist
     except ImportError as error:
         raise ImportError("pink_noise_seconds needs the package pink-noise-rl: run pip install pink-noise-rl") from error
     (action_dim,) = model.action_space.shape  # type: ignore[misc]
-    model.actor.action_dist = PinkNoiseDist(n_decisions, action_dim, rng=np.random.default_rng(model.seed))
+    model.pink_noise = PinkNoiseDist(n_decisions, action_dim, rng=np.random.default_rng(model.seed))
+    model.actor.action_dist = model.pink_noise
 
 
 def _with_reward_rate(env: GymEnv, dt: float, discount_rate: float, reward_scale: float) -> GymEnv:

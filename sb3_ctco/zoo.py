@@ -12,7 +12,6 @@ know them: it checks ``--algo`` before it imports ``--gym-packages``.
 
 import argparse
 import copy
-import inspect
 import sys
 from collections.abc import Sequence
 from importlib import resources
@@ -34,6 +33,7 @@ from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_ctco import registry
+from sb3_ctco.common.load_arguments import constructor_parameters
 from sb3_ctco.common.option_algorithm import OptionOffPolicyAlgorithm
 from sb3_ctco.envs.quiet import mute_deprecated_attributes
 
@@ -126,7 +126,7 @@ class OptionExperimentManager(ExperimentManager):
             return wrappers
         algorithm = ALGOS[self.algo]
         assert issubclass(algorithm, OptionOffPolicyAlgorithm)
-        parameters = inspect.signature(algorithm).parameters
+        parameters = constructor_parameters(algorithm)
         arguments = {name: hyperparams.get(name, parameter.default) for name, parameter in parameters.items()}
         return [*wrappers, {WRAPPER: algorithm.wrapper_kwargs(arguments)}]
 

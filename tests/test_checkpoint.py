@@ -13,6 +13,7 @@ from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecNorm
 
 from sb3_ctco import CTCO, DACPPO, FiGARSAC, OptionExecutionWrapper, OptionReplayBuffer
 from sb3_ctco.checkpoint import load_checkpoint, save_checkpoint
+from sb3_ctco.fixed_rate import FixedRateSAC, sac_at_rate
 
 OFF_POLICY = {"learning_starts": 60, "batch_size": 8, "buffer_size": 500, "policy_kwargs": {"net_arch": [8]}, "seed": 3}
 LEARNERS = {
@@ -96,6 +97,23 @@ def test_statistics_of_observations(random_walk_env, tmp_path):
     make_env = lambda: VecNormalize(vec_env(CTCO, random_walk_env), norm_reward=False)  # noqa: E731
     model = CTCO("MlpPolicy", make_env(), device="cpu", **LEARNERS[CTCO])
     assert_goes_on_alike(model, make_env, tmp_path / "checkpoint", 100, 70)
+
+
+@pytest.mark.parametrize("kwargs", [{}, {"hold_seconds": 0.3}, {"pink_noise_seconds": 2.0}], ids=str)
+def test_a_sac_of_a_fixed_rate(random_walk_env, tmp_path, kwargs):
+    small = {"buffer_size": 500, "batch_size": 8, "policy_kwargs": {"net_arch": [8]}, "seed": 3, "device": "cpu"}
+    model = sac_at_rate(random_walk_env(), 0.1, learning_starts_seconds=2.0, updates_per_second=5.0, **kwargs, **small)
+    path, env = tmp_path / "checkpoint", model.get_env()
+    model.learn(100)
+    save_checkpoint(model, path)
+    parameters = lambda: [p.detach().clone() for p in model.policy.parameters()]  # noqa: E731
+    model.learn(70, reset_num_timesteps=False)
+    expected, steps, updates = parameters(), model.num_timesteps, model._n_updates
+    model = load_checkpoint(FixedRateSAC, path, env, device="cpu").learn(70, reset_num_timesteps=False)
+    assert (model.num_timesteps, model._n_updates) == (steps, updates)
+    th.testing.assert_close(parameters(), expected, rtol=0.0, atol=0.0)
+    with pytest.raises(ValueError, match=r"a checkpoint of sb3_ctco\.fixed_rate\.FixedRateSAC: load it with that class"):
+        load_checkpoint(SAC, path, env)
 
 
 def test_what_cannot_be_saved_is_refused(random_walk_env, tmp_path):

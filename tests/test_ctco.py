@@ -1,4 +1,5 @@
 import math
+import pickle
 
 import gymnasium as gym
 import numpy as np
@@ -17,6 +18,7 @@ from sb3_ctco.common.losses import actor_loss, critic_loss, critic_target, log_r
 from sb3_ctco.common.policies import EnsembleLinear, squashed_log_prob
 from sb3_ctco.ctco.policies import CTCOPolicy
 from sb3_ctco.options import DEFAULT_DISCOUNT_RATE, discount_rate_from_gamma, step_weight
+from sb3_ctco.wrappers import TakeOverWrapper
 
 # Without sub-options, so that rows of the buffer are the decisions in their order.
 SMALL = {
@@ -313,6 +315,34 @@ def test_a_loaded_buffer_has_the_algorithms_unit_and_discount(tmp_path, random_w
     assert model.replay_buffer.reward_scale == 7.0
     with pytest.raises(ValueError, match=r"discount_rate=0.40.*discount_rate=0.20.*the same gamma and gamma_dt"):
         make(random_walk_env(), gamma_dt=0.1).load_replay_buffer(tmp_path / "buffer")
+
+
+@pytest.mark.parametrize("other", [{"gamma_dt": 0.1}, {"d_max": 0.7}, {"bounds": 1.0}, {"reward_unit": "impulse"}])
+def test_a_buffer_that_is_refused_leaves_the_models_own(tmp_path, random_walk_env, other):
+    env = random_walk_env()
+    if "bounds" in other:
+        env.action_space = spaces.Box(-other["bounds"], other["bounds"], (1,), np.float32)
+    if "reward_unit" in other:
+        env = OptionExecutionWrapper(env, reward_unit=other["reward_unit"])
+    arguments = {name: value for name, value in other.items() if name in ("gamma_dt", "d_max")}
+    make(env, **arguments).learn(30).save_replay_buffer(tmp_path / "buffer")
+    (tmp_path / "stock").write_bytes(pickle.dumps(SAC("MlpPolicy", "Pendulum-v1", buffer_size=10).replay_buffer))
+    model = make(random_walk_env()).learn(40)
+    own, size = model.replay_buffer, model.replay_buffer.size()
+    for name, message in (
+        ("buffer", "discount_rate=|d_max=|primitive_action_space=|reward_unit="),
+        ("stock", "holds a ReplayB"),
+    ):
+        with pytest.raises(ValueError, match=message):
+            model.load_replay_buffer(tmp_path / name)
+    assert model.replay_buffer is own
+    assert model.learn(20, reset_num_timesteps=False).replay_buffer.size() > size
+
+
+def test_a_warm_up_that_somebody_else_played_updates_nothing(random_walk_env):
+    env = TakeOverWrapper(random_walk_env(), lambda obs: np.zeros(1, np.float32), lambda trajectory: None)
+    model = make(OptionExecutionWrapper(env), target_decision_rate=5.0).learn(60)
+    assert (model.replay_buffer.size(), model.num_timesteps) == (0, 60)
 
 
 def test_with_one_step_options_targets_and_losses_are_sacs():
@@ -680,6 +710,26 @@ def test_a_wrapped_environment_is_used_as_it_is(random_walk_env):
     model.learn(40)
     # The Monitor that was missing stands inside, where it counts primitive steps.
     assert model.ep_info_buffer[0]["l"] == 20
+
+
+def test_what_rewards_mean_is_kept(random_walk_env, tmp_path):
+    make(OptionExecutionWrapper(random_walk_env(), reward_unit="impulse")).save(tmp_path / "model")
+    model = CTCO.load(tmp_path / "model", random_walk_env(), device="cpu")
+    assert model.get_env().get_attr("reward_unit") == ["impulse"]
+    assert model.wrap_env(random_walk_env()).reward_unit == "impulse"
+    assert model.replay_buffer.reward_unit == "impulse"
+    with pytest.raises(ValueError, match=r"reward_unit='rate', CTCO learned from 'impulse'"):
+        model.set_env(OptionExecutionWrapper(random_walk_env()))
+
+
+def test_a_dt_that_the_wrapper_was_given_is_the_models(random_walk_env):
+    """The environment says 0.1 s."""
+    model = make(OptionExecutionWrapper(random_walk_env(), dt=0.05))
+    assert model.wrap_env(random_walk_env()).option_space.dt == 0.05
+    # What was found is found again.
+    faster = random_walk_env()
+    faster.dt = 0.05
+    assert make(OptionExecutionWrapper(random_walk_env())).wrap_env(faster).option_space.dt == 0.05
 
 
 @pytest.mark.parametrize(

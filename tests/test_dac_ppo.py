@@ -33,6 +33,13 @@ def make(env, policy="MlpPolicy", **kwargs):
     return DACPPO(policy, env, **{**SMALL, **kwargs})
 
 
+def test_whole_numbers_are_refused(scripted_env):
+    env = scripted_env()
+    env.action_space = spaces.Box(0, 10, (1,), np.int64)
+    with pytest.raises(TypeError, match="needs actions that are real numbers"):
+        make(env)
+
+
 # --- π_H, from numbers worked by hand
 
 MASTER = th.tensor([[0.3, 0.7]])

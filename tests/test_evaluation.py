@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from gymnasium import spaces
 from stable_baselines3 import SAC
-from stable_baselines3.common.vec_env import DummyVecEnv
+from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
 from sb3_ctco import CTCO, OptionExecutionWrapper, RewardRateWrapper
@@ -67,6 +67,16 @@ def test_returns_of_both_kinds_are_the_integral_by_hand():
     # Three options of three steps and one cut off after one
     assert (plain.decisions, by_options.decisions) == (10, 4)
     assert by_options.decision_rate_hz == pytest.approx(4.0)
+
+
+def test_rewards_count_as_they_were_paid():
+    env = VecNormalize(DummyVecEnv([CountingEnv]), norm_reward=True)
+    (normalised,) = evaluate_discounted_return(Scripted([1.0]), env, 1, discount_rate=TAU, dt=DT)
+    (plain,) = evaluate_discounted_return(Scripted([1.0]), CountingEnv(), 1, discount_rate=TAU, dt=DT)
+    assert normalised.discounted_return == pytest.approx(plain.discounted_return)
+    callback = DiscountedReturnCallback(discount_rate=TAU, dt=DT)
+    SAC("MlpPolicy", env, buffer_size=100, learning_starts=1000).learn(10, callback)
+    assert callback.episodes[0].discounted_return == pytest.approx(plain.discounted_return)
 
 
 def test_the_rate_of_discounting_is_the_environments():

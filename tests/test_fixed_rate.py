@@ -6,6 +6,7 @@ import gymnasium as gym
 import numpy as np
 import pytest
 import torch as th
+from gymnasium import spaces
 from hypothesis import given
 from hypothesis import strategies as st
 from stable_baselines3 import SAC
@@ -17,7 +18,7 @@ from stable_baselines3.common.monitor import Monitor
 from sb3_ctco import OptionExecutionWrapper, RewardRateWrapper, sac_at_rate
 from sb3_ctco import fixed_rate as module
 from sb3_ctco.evaluation import DiscountedReturnCallback, evaluate_discounted_return
-from sb3_ctco.fixed_rate import QuickSACPolicy, hold_actions, update_schedule
+from sb3_ctco.fixed_rate import FixedRateSAC, QuickSACPolicy, hold_actions, update_schedule
 from sb3_ctco.options import DEFAULT_DISCOUNT_RATE
 from sb3_ctco.wrappers import reward_rate
 
@@ -139,7 +140,6 @@ def test_update_schedule_keeps_the_rate(updates_per_step):
 @pytest.mark.parametrize(("dt", "gamma"), [(0.05, 0.98), (0.1, 0.98**2), (0.002, 0.98**0.04)])
 def test_the_same_clock_at_every_dt(scripted_env, dt, gamma):
     model = sac_at_rate(scripted_env(dt=dt), dt, learning_starts_seconds=3.0, **SMALL)
-    assert type(model) is SAC
     assert model.gamma == pytest.approx(gamma)
     assert model.learning_starts == round(3.0 / dt)
     one = model.get_env().get_attr("option_space")[0]
@@ -254,7 +254,10 @@ def test_a_held_sac_is_saved_and_evaluated(scripted_env, tmp_path):
     env = scripted_env(dt=0.1, truncate_at=10)
     model = sac_at_rate(env, 0.1, learning_starts_seconds=0.5, hold_seconds=0.5, **SMALL).learn(40, progress_bar=False)
     model.save(tmp_path / "model")
-    loaded = SAC.load(tmp_path / "model", device="cpu")
+    loaded = FixedRateSAC.load(tmp_path / "model", env=model.get_env(), device="cpu")
+    due = loaded._n_updates
+    loaded.learn(40, reset_num_timesteps=False)
+    assert (loaded.num_timesteps, loaded._n_updates - due) == (80, 80)  # 20 a second of 0.1 s steps
     episodes = evaluate_discounted_return(
         loaded, hold_actions(env, 0.5, 1, False, 0.1, DEFAULT_DISCOUNT_RATE), 2, smoothness=True
     )
@@ -305,6 +308,27 @@ def test_the_quick_policy_is_the_same_sac(random_walk_env, hold):
     for one in (obs, obs[0]):
         actions = (model.predict(one, deterministic=True)[0] for model in (quick, stock))
         np.testing.assert_allclose(*actions, atol=1e-6)
+
+
+def test_an_environment_of_another_clock_is_refused(scripted_env):
+    model = sac_at_rate(scripted_env(dt=0.1), 0.1, **SMALL)
+    with pytest.raises(ValueError, match="wrapped as sac_at_rate wraps it"):
+        model.set_env(scripted_env(dt=0.1))
+    scale = model.get_env().get_attr("reward_scale")[0]
+    with pytest.raises(ValueError, match=r"it has d_max=.*dt=0\.05 in place of 0\.1"):
+        model.set_env(RewardRateWrapper(scripted_env(), dt=0.05, reward_scale=scale))
+    with pytest.raises(ValueError, match=r"it has reward_scale=1\.0 in place of "):
+        model.set_env(RewardRateWrapper(scripted_env(), dt=0.1))
+    model.set_env(RewardRateWrapper(scripted_env(), dt=0.1, reward_scale=scale))
+
+
+def test_the_quick_policy_knows_one_observation_from_several():
+    class Env(gym.Env):
+        observation_space, action_space = spaces.Box(-1, 1, (2, 3)), spaces.Box(-1, 1, (2,))
+
+    model = SAC(QuickSACPolicy, Env(), buffer_size=10, **SMALL)
+    assert model.predict(np.zeros((2, 3), np.float32))[0].shape == (2,)
+    assert model.predict(np.zeros((4, 2, 3), np.float32))[0].shape == (4, 2)
 
 
 def test_the_quick_policy_refuses_what_it_cannot_do(scripted_env):

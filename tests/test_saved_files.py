@@ -114,3 +114,30 @@ def test_a_replay_buffer_whose_options_mean_something_else_is_refused(tmp_path):
     model = CTCO("MlpPolicy", "Pendulum-v1", buffer_size=100, d_max=0.5, d_min=0.05, dt=0.025)
     model.load_replay_buffer(tmp_path / "buffer")  # at another rate options last as long
     assert model.replay_buffer.option_space.dt == 0.025
+
+
+def test_a_learned_penalty_is_the_files(tmp_path):
+    CTCO("MlpPolicy", "Pendulum-v1", target_decision_rate=5.0, buffer_size=10).save(tmp_path / "model")
+    with pytest.raises(ValueError, match=r"'high_freq_penalty': 0\.003.* cannot be changed while loading"):
+        CTCO.load(tmp_path / "model", high_freq_penalty=0.003)
+    assert CTCO.load(tmp_path / "model", high_freq_penalty="relative_0.1").high_freq_penalty == "relative_0.1"
+
+
+def test_a_subclass_hands_on_its_bases_arguments(tmp_path):
+    class Mine(CTCO):
+        def __init__(self, *args, alpha=0.1, **kwargs):
+            super().__init__(*args, **kwargs)
+            self.alpha = alpha
+
+    Mine("MlpPolicy", "Pendulum-v1", buffer_size=10).save(tmp_path / "model")
+    model = Mine.load(tmp_path / "model", learning_rate=1e-4, alpha=0.2)
+    assert (model.learning_rate, model.alpha) == (1e-4, 0.2)
+    with pytest.raises(TypeError, match=r"Mine has no arguments \['beta'\]"):
+        Mine.load(tmp_path / "model", beta=1)
+
+
+def test_what_logs_tell_of_is_no_part_of_a_file(tmp_path, random_walk_env):
+    model = CTCO("MlpPolicy", random_walk_env(), gradient_steps=0, buffer_size=500).learn(100, log_interval=None)
+    assert len(model._durations_since_log) > 0
+    model.save(tmp_path / "model")
+    assert len(CTCO.load(tmp_path / "model")._durations_since_log) == 0

@@ -51,6 +51,8 @@ class _OptionStorage(ReplayBuffer):
     n_demonstrations = 0
     option_space: OptionSpace | None = None
     primitive_action_space: spaces.Box | None = None
+    #: That of the model's environment; None where no model told
+    reward_unit: RewardUnit | None = None
 
     def __init__(
         self,
@@ -184,7 +186,7 @@ class _OptionStorage(ReplayBuffer):
         *,
         n_stretches: int = 1,
         tolerance: float = 0.1,
-        reward_unit: RewardUnit = "rate",
+        reward_unit: RewardUnit | None = None,
     ) -> AddedTrajectory:
         """Store stretches of a trajectory of primitive actions, whoever chose them, as options.
 
@@ -206,7 +208,8 @@ class _OptionStorage(ReplayBuffer):
         :param n_stretches: how many begin at each step; those that would be too short at its end are left out
         :param tolerance: refuse a stretch if its option's actions deviate by more from those recorded; actions count as
             normalised to [−1, 1]. Noisy actions of a fixed rate fit no option of more than n_rbf steps well
-        :param reward_unit: ``"rate"`` or ``"impulse"``, see :func:`~sb3_ctco.options.integrated_reward`
+        :param reward_unit: ``"rate"`` or ``"impulse"``, see :func:`~sb3_ctco.options.integrated_reward`; by default what the
+            model's environment has
         :raises ValueError: if a number is out of range or not finite, a shape is wrong, ``dt`` fits no option, the buffer
             does not know what options mean, or its rows do not suffice
         """
@@ -217,6 +220,7 @@ class _OptionStorage(ReplayBuffer):
             )
         if not (dt > 0 and math.isfinite(dt)):
             raise ValueError(f"dt must be a positive number of seconds, not {dt}")
+        reward_unit = reward_unit or self.reward_unit or "rate"
         if n_stretches < 1 or not tolerance >= 0 or reward_unit not in REWARD_UNITS:
             raise ValueError(
                 f"n_stretches must be at least 1, tolerance at least 0, and reward_unit one of {REWARD_UNITS}, not "

@@ -29,7 +29,7 @@ def check_load_arguments(
     :raises TypeError: for an argument that the class's constructor does not have
     :raises ValueError: for one of ``kept`` that differs from the file's
     """
-    known = inspect.signature(algorithm.__init__).parameters.keys() - {"self", "policy", "env", "device", "_init_setup_model"}
+    known = constructor_parameters(algorithm).keys() - {"policy", "env", "device", "_init_setup_model"}
     unknown = sorted(arguments.keys() - known)
     if unknown:
         raise TypeError(f"{algorithm.__name__} has no arguments {unknown} to change while loading; it has {sorted(known)}")
@@ -46,6 +46,21 @@ def check_load_arguments(
                 f"out, or make a new model; these can be changed: {sorted(known - set(kept))}"
             )
     return {"_stats_window_size" if name == "stats_window_size" else name: value for name, value in arguments.items()}
+
+
+def constructor_parameters(algorithm: type[BaseAlgorithm]) -> dict[str, inspect.Parameter]:
+    """What an algorithm's constructor takes by name, with what a subclass hands on to its base as ``**kwargs``."""
+    found: dict[str, inspect.Parameter] = {}
+    for cls in algorithm.__mro__:
+        if "__init__" not in vars(cls):
+            continue
+        parameters = dict(inspect.signature(cls).parameters)
+        for name, parameter in parameters.items():
+            if parameter.kind not in (parameter.VAR_POSITIONAL, parameter.VAR_KEYWORD):
+                found.setdefault(name, parameter)
+        if not any(parameter.kind is parameter.VAR_KEYWORD for parameter in parameters.values()):
+            break
+    return found
 
 
 def _equal(one: Any, other: Any) -> bool:

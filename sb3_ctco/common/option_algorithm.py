@@ -7,6 +7,7 @@ import math
 import pathlib
 import warnings
 import zipfile
+from collections import deque
 from typing import Any, ClassVar, TypeVar
 
 import gymnasium as gym
@@ -45,9 +46,20 @@ from sb3_ctco.common.buffers import DictOptionReplayBuffer, OptionReplayBuffer
 from sb3_ctco.common.callbacks import as_callback, eval_callbacks, in_primitive_steps
 from sb3_ctco.common.load_arguments import check_load_arguments
 from sb3_ctco.option_array import OptionArray
-from sb3_ctco.options import OPTIONS_OF_0_1_0, DurationScale, Join, OptionSpace, Trajectory, discount_rate_from_gamma
+from sb3_ctco.options import (
+    OPTIONS_OF_0_1_0,
+    DurationScale,
+    Join,
+    OptionSpace,
+    RewardUnit,
+    Trajectory,
+    discount_rate_from_gamma,
+)
 from sb3_ctco.vec_env import PLAYED, AsyncOptionVecEnv
 from sb3_ctco.wrappers import OptionExecutionWrapper, find_dt
+
+#: Of how many decisions logs tell at most
+_MAX_LOGGED = 100_000
 
 SelfOptionOffPolicyAlgorithm = TypeVar("SelfOptionOffPolicyAlgorithm", bound="OptionOffPolicyAlgorithm")
 
@@ -137,11 +149,13 @@ class OptionOffPolicyAlgorithm(OffPolicyAlgorithm):
             )
         self.updates_per_second = updates_per_second
         self.n_sub_options = n_sub_options
-        self._residuals_since_log: list[float] = []
-        #: The action space of the bare environment; None until there is an environment.
+        #: Of the latest decisions since logs were written
+        self._residuals_since_log: deque[float] = deque(maxlen=_MAX_LOGGED)
+        self._durations_since_log: deque[float] = deque(maxlen=_MAX_LOGGED)
+        #: The action space of the bare environment, and the unit of its rewards; None until there is an environment.
         self.primitive_action_space: spaces.Box | None = None
+        self.reward_unit: RewardUnit | None = None
         self._updates_due = 0.0
-        self._durations_since_log: list[float] = []
 
         if env is not None:
             env = self._as_option_env(maybe_make_env(env, verbose))
@@ -197,7 +211,8 @@ class OptionOffPolicyAlgorithm(OffPolicyAlgorithm):
         dt = self.dt if self._dt_was_given else (find_dt(env) or self.dt)
         if unwrap_wrapper(env, Monitor) is None:
             env = Monitor(env)
-        return OptionExecutionWrapper(env, **{**self._option_arguments, "dt": dt}, n_sub_options=n_sub_options)
+        arguments = {**self._option_arguments, "dt": dt, "reward_unit": self.reward_unit or "rate"}
+        return OptionExecutionWrapper(env, **arguments, n_sub_options=n_sub_options)
 
     def _as_option_env(self, env: GymEnv) -> GymEnv:
         if isinstance(env, VecEnv):
@@ -257,6 +272,10 @@ class OptionOffPolicyAlgorithm(OffPolicyAlgorithm):
                 wrapper = wrapper.venv
         settings = self._check_settings(env)
         self.primitive_action_space = env.get_attr("primitive_action_space")[0]
+        self.reward_unit = env.get_attr("reward_unit")[0]
+        if env.get_attr("overrides_dt")[0]:
+            # The user's word to the wrapper
+            self._dt_was_given = True
         # No setting that both must share, but what one wants of the other.
         env.env_method("set_n_sub_options", self.n_sub_options)
         return settings
@@ -272,6 +291,13 @@ class OptionOffPolicyAlgorithm(OffPolicyAlgorithm):
                 raise ValueError(
                     f"the environment's options have {name}={found}, {type(self).__name__} has "
                     f"{name}={value}: give both the same (discount_rate is -ln(gamma)/gamma_dt)"
+                )
+        units: list[RewardUnit] = env.get_attr("reward_unit")
+        for unit in units:
+            if unit != (self.reward_unit or units[0]):
+                raise ValueError(
+                    f"the environment's rewards have reward_unit={unit!r}, {type(self).__name__} learned from "
+                    f"{self.reward_unit or units[0]!r}: give both the same"
                 )
         action_spaces: list[spaces.Box] = env.get_attr("primitive_action_space")
         for space in action_spaces:
@@ -316,7 +342,9 @@ class OptionOffPolicyAlgorithm(OffPolicyAlgorithm):
         older = cls._arguments_of_older_files(saved) if saved else {}
         if kwargs.get("d_min") == 0.0:
             kwargs["d_min"] = saved.get("dt")  # as which it was saved
-        kwargs = {**older, **check_load_arguments(cls, path, kwargs, cls._kept_when_loaded, older)}
+        # With a target rate β_h is learned, and the file has it.
+        learned = ["high_freq_penalty"] if saved.get("target_decision_rate") is not None else []
+        kwargs = {**older, **check_load_arguments(cls, path, kwargs, [*cls._kept_when_loaded, *learned], older)}
         if "replay_buffer_kwargs" in kwargs:
             given = kwargs["replay_buffer_kwargs"] or {}
             unit = saved.get("replay_buffer_kwargs", {}).get("reward_scale", 1.0)
@@ -400,6 +428,7 @@ class OptionOffPolicyAlgorithm(OffPolicyAlgorithm):
         buffer = self.replay_buffer
         if isinstance(buffer, OptionReplayBuffer | DictOptionReplayBuffer) and None not in (self.dt, self.d_min):
             buffer.option_space, buffer.primitive_action_space = self.option_space, self.primitive_action_space
+            buffer.reward_unit = self.reward_unit or "rate"
 
     def _warn_of_a_large_buffer(self) -> None:
         buffer, available = self.replay_buffer, _available_memory()
@@ -420,13 +449,23 @@ class OptionOffPolicyAlgorithm(OffPolicyAlgorithm):
     def load_replay_buffer(self, path: str | pathlib.Path | io.BufferedIOBase, truncate_last_traj: bool = True) -> None:
         """Stable-Baselines3's; what is in the buffer is scaled as this algorithm scales rewards.
 
-        :raises ValueError: if its options were discounted at another rate, or mean something else
+        :raises ValueError: if its options were discounted at another rate, or mean something else; the own buffer stays then
         """
-        super().load_replay_buffer(path, truncate_last_traj)
+        own = self.replay_buffer
+        try:
+            super().load_replay_buffer(path, truncate_last_traj)
+            self._check_loaded_buffer(path)
+        except BaseException:
+            self.replay_buffer = own
+            raise
+        self.replay_buffer.reward_scale = self.replay_buffer_kwargs["reward_scale"]  # type: ignore[union-attr]
+        self._tell_buffer()
+
+    def _check_loaded_buffer(self, path: Any) -> None:
         buffer = self.replay_buffer
-        assert isinstance(buffer, OptionReplayBuffer | DictOptionReplayBuffer)
+        if not isinstance(buffer, OptionReplayBuffer | DictOptionReplayBuffer):
+            raise ValueError(f"{path} holds a {type(buffer).__name__}, which does not have the durations of options")
         if not math.isclose(buffer.discount_rate, self.discount_rate, rel_tol=1e-6):
-            self.replay_buffer = None
             raise ValueError(
                 f"the replay buffer in {path} has discount_rate={buffer.discount_rate}, {type(self).__name__} has "
                 f"discount_rate={self.discount_rate}: load it into a model with the same gamma and gamma_dt"
@@ -434,14 +473,16 @@ class OptionOffPolicyAlgorithm(OffPolicyAlgorithm):
         if buffer.option_space is not None and None not in (self.dt, self.d_min):
             # At another rate options last as long.
             of_buffer = dataclasses.replace(buffer.option_space, dt=self.option_space.dt)
-            for name, (value, found) in self.option_space.differences(of_buffer).items():
-                self.replay_buffer = None
+            differences = self.option_space.differences(of_buffer)
+            for name in ("primitive_action_space", "reward_unit"):
+                value, found = getattr(self, name), getattr(buffer, name)
+                if None not in (value, found) and value != found:
+                    differences[name] = value, found
+            for name, (value, found) in differences.items():
                 raise ValueError(
                     f"the options in the replay buffer in {path} have {name}={found}, {type(self).__name__} has "
                     f"{name}={value}: load it into a model with the same"
                 )
-        buffer.reward_scale = self.replay_buffer_kwargs["reward_scale"]
-        self._tell_buffer()
 
     def go_on_from(self, learned: "OptionOffPolicyAlgorithm") -> None:
         """Take over what another model of this algorithm found in what it saw, beside what networks and optimizers hold.
@@ -518,6 +559,9 @@ class OptionOffPolicyAlgorithm(OffPolicyAlgorithm):
             self._updates_due -= steps
         return rollout._replace(episode_timesteps=steps)
 
+    def _excluded_save_params(self) -> list[str]:
+        return [*super()._excluded_save_params(), "_durations_since_log", "_residuals_since_log"]
+
     def _store_transition(
         self,
         replay_buffer: ReplayBuffer,
@@ -554,7 +598,7 @@ class OptionOffPolicyAlgorithm(OffPolicyAlgorithm):
             self.logger.record("option/duration_mean", duration)
             self.logger.record("option/decision_rate_hz", 1.0 / duration)
             # TensorBoard shows a tensor as a histogram; other formats cannot.
-            durations = th.tensor(self._durations_since_log)
+            durations = th.tensor([*self._durations_since_log])
             self.logger.record("option/duration", durations, exclude=("stdout", "log", "json", "csv"))
             self._durations_since_log.clear()
         if self._residuals_since_log:

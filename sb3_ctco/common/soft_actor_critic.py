@@ -145,12 +145,14 @@ class SoftOptionActorCritic(OptionOffPolicyAlgorithm):
         raise NotImplementedError
 
     def train(self, gradient_steps: int, batch_size: int = 64) -> None:
-        """Sample the replay buffer and update temperatures, critics, actor and targets.
+        """Sample the replay buffer and update temperatures, critics, actor and targets; nothing while it is empty.
 
         :param gradient_steps: number of updates
         :param batch_size: decisions in a minibatch
         """
         assert self.replay_buffer is not None
+        if not self.replay_buffer.size():
+            return  # All that was played was somebody else's.
         self.policy.set_training_mode(True)
         optimizers = [self.actor.optimizer, self.critic.optimizer]
         if self.ent_coef_optimizer is not None:

@@ -377,11 +377,13 @@ class CTCO(SoftOptionActorCritic):
         return options if self._canonical is None else self._canonical(options)
 
     def train(self, gradient_steps: int, batch_size: int = 64) -> None:
-        """Sample the replay buffer and update temperatures, critics, actor and targets.
+        """Sample the replay buffer and update temperatures, critics, actor and targets; nothing while it is empty.
 
         :param gradient_steps: number of updates
         :param batch_size: decisions in a minibatch
         """
+        if not self.replay_buffer.size():  # type: ignore[union-attr]
+            return
         if self.target_decision_rate is not None:
             self._update_high_freq_penalty()
         self._penalty_unit = self._paid_in_the_shortest_option()

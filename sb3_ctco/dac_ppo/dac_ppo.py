@@ -174,6 +174,8 @@ class DACPPO(OnPolicyAlgorithm):
             self._setup_model()
 
     def _setup_model(self) -> None:
+        if not np.issubdtype(self.action_space.dtype, np.floating):  # type: ignore[arg-type]
+            raise TypeError(f"DACPPO needs actions that are real numbers, not {self.action_space}, which it would round")
         if self.env is not None:
             self._check_env(self.env)
         if self.rollout_buffer_class is None:

@@ -557,6 +557,7 @@ def _meaning(model: OffPolicyAlgorithm) -> dict[str, Any]:
         # A trajectory that is no name is a class, of which JSON keeps the name.
         arguments = model.option_space.arguments
         options = {name: value if isinstance(value, int | float | str) else str(value) for name, value in arguments.items()}
+        options["reward_unit"] = model.reward_unit
     return {
         "algorithm": type(model).__name__,
         "options": options,
