@@ -23,7 +23,7 @@ from rliable.metrics import aggregate_iqm, probability_of_improvement
 from sb3_ctco.evaluation import evaluate_discounted_return
 from sb3_ctco.registry import ALGORITHMS as ALGORITHM_ROWS
 from sb3_ctco.registry import TASKS, Task, find_task
-from sb3_ctco.study import agents, engines, plots, runs, schedule, scores, status
+from sb3_ctco.study import agents, engines, plots, runs, schedule, scores, status, tables
 from sb3_ctco.study.cli import main
 from sb3_ctco.study.grid import Run, load_preset, preset_names
 from sb3_ctco.study.records import COLUMNS, collect, paper_returns, read_curves, read_records
@@ -63,7 +63,8 @@ def tiny(folder: Path, name: str = "tiny", **changes) -> str:
 
 @pytest.fixture
 def few_resamples(monkeypatch):
-    monkeypatch.setattr(plots, "_BOOTSTRAP_REPETITIONS", 50)
+    for module in (plots, scores):
+        monkeypatch.setattr(module, "BOOTSTRAP_REPETITIONS", 50)
 
 
 def wait_for(condition) -> None:
@@ -625,8 +626,8 @@ def test_the_numbers_of_the_paper():
 
 def test_mean_and_interval_by_hand():
     # t(0.975, 1) = 12.706, the standard deviation of 1 and 1.2 is 0.2/√2, by √2 seeds.
-    assert plots.mean_and_interval([1.0, 1.2]) == pytest.approx((1.1, 12.706 * 0.1), rel=1e-4)
-    mean, half_width = plots.mean_and_interval([0.5])
+    assert scores.mean_and_interval([1.0, 1.2]) == pytest.approx((1.1, 12.706 * 0.1), rel=1e-4)
+    mean, half_width = scores.mean_and_interval([0.5])
     assert mean == 0.5
     assert math.isnan(half_width)
 
@@ -656,17 +657,17 @@ def test_the_figure_shows_the_records_and_the_paper():
 
 @pytest.mark.usefixtures("few_resamples")
 def test_interquartile_means_are_those_of_rliable():
-    estimates = plots.interquartile_means(synthetic(), "discounted_return")
+    estimates = scores.interquartile_means(synthetic(), "discounted_return")
     tau = -math.log(0.98) / 0.05
     returns = [paper_returns()[task, "sac"][50] for task in ("point_mass", "cheetah", "ball_in_cup")]
-    scores = tau * np.array([[value - 0.1 for value in returns], [value + 0.1 for value in returns]])
+    fractions = tau * np.array([[value - 0.1 for value in returns], [value + 0.1 for value in returns]])
     mean, low, high = estimates["sac", "large"][50]
-    assert mean == pytest.approx(aggregate_iqm(scores))
+    assert mean == pytest.approx(aggregate_iqm(fractions))
     assert low < mean < high
     # Without one task of one seed, the other seed remains, and there is no interval.
     holed = [one for one in synthetic() if not (one["algorithm"] == "sac" and one["seed"] == 1 and one["task"] == "cheetah")]
-    mean, low, high = plots.interquartile_means(holed, "discounted_return")["sac", "large"][50]
-    assert mean == pytest.approx(aggregate_iqm(scores[:1]))
+    mean, low, high = scores.interquartile_means(holed, "discounted_return")["sac", "large"][50]
+    assert mean == pytest.approx(aggregate_iqm(fractions[:1]))
     assert math.isnan(low)
     assert math.isnan(high)
 
@@ -689,8 +690,8 @@ def with_repeats():
 
 def test_sac_stands_for_a_repeat_of_one_step_and_the_best_is_a_line():
     records = scores.with_equal_repeats(with_repeats())
-    assert plots.lines_of(records) == [("sac", "large"), ("sac_repeat", "20ms"), ("sac_repeat", "best")]
-    lines = plots.by_line(records, "cheetah", "discounted_return")
+    assert scores.lines_of(records) == [("sac", "large"), ("sac_repeat", "20ms"), ("sac_repeat", "best")]
+    lines = scores.by_line(records, "cheetah", "discounted_return")
     sac = lines["sac", "large"]
     assert lines["sac_repeat", "best"] == {50: [2.0, 2.0], 100: sac[100], 250: [0.1, 0.1], 500: [2.0, 2.0]}
     # 20 ms at 50 Hz is a step.
@@ -733,7 +734,7 @@ def test_scores_by_hand(few_resamples):
     )
     _, low, high = better["sac", "a"][50]
     assert low <= 0.125 <= high
-    assert "| CTCO | a | 0.50 [" in scores.averaged_table(relative)
+    assert "| CTCO | a | 0.50 [" in tables.averaged_table(relative)
     # A rate that a line lacks leaves it out of the average over rates, and in at the others.
     without = scores.relative_scores([r for r in records if (r["algorithm"], r["dt"]) != ("sac", 0.02)], "discounted_return")
     assert list(scores.frequency_averaged(without)) == [("ctco", "a")]
@@ -741,7 +742,7 @@ def test_scores_by_hand(few_resamples):
 
 
 def test_the_pareto_figure_joins_the_settings_of_an_algorithm():
-    figure = scores.draw_pareto(with_repeats(), "discounted_return")
+    figure = plots.draw_pareto(with_repeats(), "discounted_return")
     assert len(figure.axes) == 4 * 3
     ax = next(ax for ax in figure.axes if ax.get_title() == "cheetah run, 500 Hz")
     points = {container.get_label(): container.lines[0].get_xydata().tolist() for container in ax.containers}
@@ -750,16 +751,16 @@ def test_the_pareto_figure_joins_the_settings_of_an_algorithm():
 
 
 def test_the_table_stands_beside_the_papers_numbers():
-    estimates = {"discounted_return": plots.interquartile_means(synthetic(), "discounted_return")}
-    lines = plots.table(synthetic(), estimates).splitlines()
+    estimates = {"discounted_return": scores.interquartile_means(synthetic(), "discounted_return")}
+    lines = tables.table(synthetic(), estimates).splitlines()
     training = lines[: lines.index("## Discounted return, greedy episodes")]
     assert "| cheetah run | SAC | large | 2 | 1.07 ± 1.27 | 0.15 ± 1.27 | 0.06 ± 1.27 | 0.07 ± 1.27 |" in training
     assert "| cheetah run | SAC | *the paper's figure* | 30 | 1.07 | 0.15 | 0.06 | 0.07 |" in training
     assert "| cheetah run | SAC | large | 2 | 1.27 ± 1.27 | 0.35 ± 1.27 | 0.26 ± 1.27 | 0.27 ± 1.27 |" in lines
     assert any(line.startswith("| training | CTCO | tuned | ") and "[" in line for line in lines)
     assert lines[0].startswith("Preset quick (2400 s of task time); 2 seeds; commit abc1234.")
-    assert "| cheetah run | SAC | large | 1 | 0.97 | 0.05 | -0.04 | -0.03 |" in plots.table(synthetic(1), {})
-    assert "; 1 to 2 seeds; " in plots.table(synthetic()[1:], {})
+    assert "| cheetah run | SAC | large | 1 | 0.97 | 0.05 | -0.04 | -0.03 |" in tables.table(synthetic(1), {})
+    assert "; 1 to 2 seeds; " in tables.table(synthetic()[1:], {})
 
 
 @pytest.mark.slow
@@ -1022,7 +1023,7 @@ def test_a_legend_has_what_any_panel_has():
 
 def test_interquartile_means_of_costs_stand_upright():
     records = [{**record, "discounted_return": -1.0 - record["discounted_return"]} for record in synthetic()]
-    estimates = {name: plots.interquartile_means(records, name) for name in ("discounted_return", "greedy_return")}
+    estimates = {name: scores.interquartile_means(records, name) for name in ("discounted_return", "greedy_return")}
     low, high = plots.draw_interquartile_means(records, estimates).axes[0].get_ylim()
     assert low < 0.0 <= high
 

@@ -1,16 +1,13 @@
-"""Figures and tables of a study's records."""
+"""Figures of a study's records."""
 
-import contextlib
-import math
-from collections import Counter, defaultdict
-from collections.abc import Iterator, Sequence
+from collections import defaultdict
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from sb3_ctco.options import DEFAULT_DISCOUNT_RATE
-from sb3_ctco.registry import ALGORITHMS, TASKS, find_task
+from sb3_ctco.registry import ALGORITHMS, find_task
 from sb3_ctco.study.records import (
     CURVE_EPISODES,
     Record,
@@ -20,98 +17,108 @@ from sb3_ctco.study.records import (
     read_records,
     refuse_other_fingerprint,
 )
+from sb3_ctco.study.scores import (
+    BOOTSTRAP_REPETITIONS,
+    Estimates,
+    Line,
+    by_line,
+    frequency_averaged,
+    improvement,
+    interquartile_means,
+    line_of,
+    lines_of,
+    mean_and_interval,
+    rate_of,
+    relative_scores,
+    repeatable,
+    seeds_in_words,
+    tasks_of,
+    with_equal_repeats,
+)
+from sb3_ctco.study.tables import METRICS, averaged_table, table
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-METRICS = {
-    "discounted_return": "discounted return,\ntraining episodes of the last tenth",
-    "greedy_return": "discounted return,\ngreedy episodes",
-    "decision_rate_hz": "decisions a second,\ntraining episodes of the last tenth",
-}
 _DASHES = ("-", "-.", ":")
-#: Resamples of the bootstrap, as many as rliable's authors take for figures
-_BOOTSTRAP_REPETITIONS = 2000
-
-#: An algorithm and its setting, which is a line of a figure
-Line = tuple[str, str]
-#: Interquartile mean with lower and upper bound, by line, then by rate in Hz
-Estimates = dict[Line, dict[int, tuple[float, float, float]]]
+_DECISION_RATES = (1, 2, 5, 10, 20, 50, 100, 200, 500)
 
 
-def mean_and_interval(values: Sequence[float]) -> tuple[float, float]:
-    """Mean over seeds, and half the width of its 95 % interval (Student's t; nan for one seed)."""
-    from scipy.stats import t
+def plot(
+    sources: Sequence[Path], output: Path, algorithms: Sequence[str] | None = None, settings: Sequence[str] | None = None
+) -> list[Path]:
+    """Draw everything that studies' folders, or CSV files of their records, have the data for.
 
-    n = len(values)
-    half_width = float(t.ppf(0.975, n - 1)) * float(np.std(values, ddof=1)) / math.sqrt(n) if n > 1 else math.nan
-    return float(np.mean(values)), half_width
-
-
-@contextlib.contextmanager
-def repeatable() -> Iterator[None]:
-    """The same intervals each time: rliable draws from NumPy's global generator."""
-    state = np.random.get_state()
-    np.random.seed(0)
-    try:
-        yield
-    finally:
-        np.random.set_state(state)
-
-
-def by_line(records: Sequence[Record], task: str, metric: str) -> dict[Line, dict[int, list[float]]]:
-    """A metric of one task, by algorithm and setting, then by rate in Hz: one value a seed."""
-    lines: dict[Line, dict[int, list[float]]] = {line: defaultdict(list) for line in lines_of(records)}
-    for record in records:
-        if record["task"] == task:
-            lines[_line_of(record)][_rate(record)].append(record[metric])
-    return {line: dict(sorted(rates.items())) for line, rates in lines.items() if rates}
-
-
-def lines_of(records: Sequence[Record]) -> list[Line]:
-    """Algorithms and settings that occur, in a fixed order; the paper's settings come after others."""
-    present = {_line_of(record) for record in records}
-    return sorted(present, key=lambda line: (list(ALGORITHMS).index(line[0]), line[1] == "paper", line[1]))
-
-
-def tasks_of(records: Sequence[Record]) -> list[str]:
-    """Tasks that occur: the paper's in its order, and then others."""
-    present = {record["task"] for record in records}
-    return [*(task for task in TASKS if task in present), *sorted(present - set(TASKS))]
-
-
-def interquartile_means(records: Sequence[Record], metric: str) -> Estimates:
-    """Interquartile means over seeds and tasks with their 95 % intervals, from rliable.
-
-    Scores are returns times the paper's τ, 0.404/s, that is fractions of the most that a reward of 1 a second can give. A rate
-    needs at least one seed that is complete in all tasks; its interval is that of a bootstrap over seeds within tasks, and nan
-    for one.
+    :param sources: folders or files; the learning curves of a file are in the one beside it
+    :param output: folder for figures (PNG and SVG) and ``table.md``
+    :param algorithms: only these; all by default
+    :param settings: likewise; ``best`` is the best action repeat
+    :return: the files written
+    :raises ValueError: if nothing is left
     """
-    from rliable.library import get_interval_estimates
-    from rliable.metrics import aggregate_iqm
+    import matplotlib as mpl
 
-    tasks = tasks_of(records)
-    values = {(_line_of(record), _rate(record), record["seed"], record["task"]): record[metric] for record in records}
-    rates = sorted({_rate(record) for record in records})
-    seeds = sorted({record["seed"] for record in records})
-    estimates: Estimates = {}
-    for line in lines_of(records):
-        for rate in rates:
-            complete = [seed for seed in seeds if all((line, rate, seed, task) in values for task in tasks)]
-            if not complete:
-                continue
-            scores = np.array([[values[line, rate, seed, task] for task in tasks] for seed in complete])
-            scores = scores * DEFAULT_DISCOUNT_RATE
-            low = high = math.nan
-            if len(complete) > 1:
-                with repeatable():
-                    _, interval = get_interval_estimates(
-                        {"": scores}, lambda x: np.array([aggregate_iqm(x)]), reps=_BOOTSTRAP_REPETITIONS
-                    )
-                low, high = (float(bound) for bound in interval[""][:, 0])
-            estimates.setdefault(line, {})[rate] = (float(aggregate_iqm(scores)), low, high)
-    return estimates
+    mpl.use("Agg")
+    import matplotlib.pyplot as plt
+
+    by = list(algorithms or ALGORITHMS)
+
+    def chosen(rows: Sequence[Record]) -> list[Record]:
+        return [row for row in rows if row["algorithm"] in by and (settings is None or row["setting"] in settings)]
+
+    # Text as text, and the same bytes for the same records.
+    mpl.rcParams.update({"svg.fonttype": "none", "svg.hashsalt": "sb3-ctco"})
+    everything = _merged(sources)
+    records = chosen(with_equal_repeats(everything))
+    if not records:
+        raise ValueError(f"no record has an algorithm of {algorithms} and a setting of {settings}: {lines_of(everything)}")
+    output.mkdir(parents=True, exist_ok=True)
+    estimates = {metric: interquartile_means(records, metric) for metric in ("discounted_return", "greedy_return")}
+    relative = relative_scores(records, "discounted_return")
+    figures = {
+        "frequency": draw_metric(records, "discounted_return"),
+        "frequency_greedy": draw_metric(records, "greedy_return"),
+        "decision_rates": draw_metric(records, "decision_rate_hz"),
+        "interquartile_means": draw_interquartile_means(records, estimates),
+        "pareto": draw_pareto([row for row in everything if row["algorithm"] in by], "discounted_return"),
+    }
+    if relative:
+        figures["profiles"] = draw_profiles(records, relative)
+        figures["improvement"] = draw_improvement(records, relative)
+    # A run that is in several sources is one run.
+    of_runs = {(*key(point), point["seconds"]): point for source in sources for point in read_curves(source)}
+    if points := chosen(list(of_runs.values())):
+        figures["learning_curves"] = draw_learning_curves(points)
+    written = []
+    for name, figure in figures.items():
+        for ending, metadata in (("png", None), ("svg", {"Date": None})):
+            written.append(output / f"{name}.{ending}")
+            figure.savefig(written[-1], dpi=120, metadata=metadata)
+        plt.close(figure)
+    written.append(output / "table.md")
+    written[-1].write_text(table(records, estimates) + averaged_table(relative), encoding="utf-8")
+    return written
+
+
+def _merged(sources: Sequence[Path]) -> list[Record]:
+    """The records of all sources, each run once.
+
+    :raises ValueError: if a run is there with different settings, or if runs of different lengths would make one mean
+    """
+    merged: dict[tuple[Any, ...], Record] = {}
+    lengths: dict[tuple[Any, ...], Record] = {}
+    for source in sources:
+        for record in read_records(source):
+            there = merged.setdefault(key(record), record)
+            refuse_other_fingerprint(there["fingerprint"], record["fingerprint"], key(record), source)
+            of_mean = lengths.setdefault((record["task"], line_of(record), rate_of(record)), record)
+            if of_mean["task_seconds"] != record["task_seconds"]:
+                raise ValueError(
+                    f"{source} has runs of preset {record['preset']} with {record['task_seconds']:g} s of task time, and "
+                    f"preset {of_mean['preset']} has {of_mean['task_seconds']:g} s: they make no mean, plot one of them"
+                )
+    return list(merged.values())
 
 
 def draw_metric(records: Sequence[Record], metric: str) -> "Figure":
@@ -142,7 +149,7 @@ def draw_metric(records: Sequence[Record], metric: str) -> "Figure":
         else:
             _return_axis(ax, shown)
     axes[0][0].set_ylabel(METRICS[metric])
-    seeds = _seeds(records)
+    seeds = seeds_in_words(records)
     _legend(figure, seeds if seeds == "1 seed" else f"mean and 95 % interval (Student's t) of {seeds}; a dot a seed")
     return figure
 
@@ -164,7 +171,7 @@ def draw_interquartile_means(records: Sequence[Record], estimates: dict[str, Est
         lowest = min((mean for rates in of_lines.values() for mean, _, _ in rates.values()), default=0.0)
         ax.set_ylim(min(0.0, 1.08 * lowest), max(0.0, ax.get_ylim()[1]))
     axes[0][0].set_ylabel("interquartile mean\nof discounted return × 0.404/s")
-    seeds = _seeds(records)
+    seeds = seeds_in_words(records)
     _legend(figure, seeds if seeds == "1 seed" else f"95 % intervals: stratified bootstrap over {seeds}")
     return figure
 
@@ -177,10 +184,10 @@ def draw_learning_curves(points: Sequence[Record]) -> "Figure":
     :param points: of :func:`~sb3_ctco.study.records.read_curves`
     """
     tasks, lines = tasks_of(points), lines_of(points)
-    rates = sorted({_rate(point) for point in points})
+    rates = sorted({rate_of(point) for point in points})
     runs: dict[tuple[str, int, Line], dict[int, list[tuple[float, float]]]] = defaultdict(lambda: defaultdict(list))
     for point in points:
-        of_seeds = runs[point["task"], _rate(point), _line_of(point)]
+        of_seeds = runs[point["task"], rate_of(point), line_of(point)]
         of_seeds[point["seed"]].append((point["seconds"], point["discounted_return"]))
     figure, axes = _panels(len(rates), len(tasks))
     for row, rate in zip(axes, rates, strict=True):
@@ -204,7 +211,7 @@ def draw_learning_curves(points: Sequence[Record]) -> "Figure":
         row[0].set_ylabel("discounted return")
     for ax in axes[-1]:
         ax.set_xlabel("task time [min]")
-    seeds = _seeds(list({key(point): point for point in points}.values()))
+    seeds = seeds_in_words(list({key(point): point for point in points}.values()))
     episodes = f"mean of (up to) {CURVE_EPISODES} training episodes"
     interval = "" if seeds == "1 seed" else f"; mean of {seeds}, 95 % interval (Student's t) of 3 or more"
     _legend(figure, episodes + interval)
@@ -222,145 +229,94 @@ def _together(curves: Sequence[Sequence[tuple[float, float]]]) -> dict[float, li
     return together
 
 
-def table(records: Sequence[Record], estimates: dict[str, Estimates]) -> str:
-    """Markdown: returns and decision rates of each task, algorithm and rate, beside the paper's returns.
-
-    :param records: of the runs
-    :param estimates: interquartile means by metric
-    """
-    rates = sorted({_rate(record) for record in records})
-    presets = sorted({f"{record['preset']} ({record['task_seconds']:g} s of task time)" for record in records})
-    commits = sorted({record["commit"] for record in records})
-    parts = [
-        f"Preset {', '.join(presets)}; {_seeds(records)}; commit {', '.join(commits)}. Means over seeds, ± half of the 95 % "
-        "interval (Student's t) where there are at least two.\n"
-    ]
-    for metric, name in METRICS.items():
-        parts.append(f"## {name.replace(chr(10), ' ').capitalize()}\n")
-        parts.append(_row("task", "algorithm", "setting", "seeds", *(f"{rate} Hz" for rate in rates)))
-        parts.append(_row(*["---"] * (4 + len(rates))))
-        for task in tasks_of(records):
-            for (algorithm, setting), values in by_line(records, task, metric).items():
-                numbers = sorted({len(one) for one in values.values()})
-                seeds = "–".join(str(number) for number in {numbers[0]: 0, numbers[-1]: 0})
-                cells = (_cell(values.get(rate, [])) for rate in rates)
-                parts.append(_row(find_task(task).label, ALGORITHMS[algorithm].label, setting, seeds, *cells))
-            if metric != "decision_rate_hz":
-                for algorithm in ALGORITHMS:
-                    numbers_of_paper = paper_returns().get((task, algorithm))
-                    if numbers_of_paper is None:
-                        continue
-                    cells = (f"{numbers_of_paper[rate]:.2f}" if rate in numbers_of_paper else "–" for rate in rates)
-                    parts.append(
-                        _row(find_task(task).label, ALGORITHMS[algorithm].label, "*the paper's figure*", "30", *cells)
-                    )
-        parts.append("")
-    parts.append("## Interquartile means\n")
-    parts.append(
-        "Over tasks and seeds, of discounted return × τ (a fraction of the most that a reward of 1 a second can give), with "
-        "95 % intervals of rliable's stratified bootstrap where there are at least two seeds.\n"
-    )
-    parts.append(_row("episodes", "algorithm", "setting", *(f"{rate} Hz" for rate in rates)))
-    parts.append(_row(*["---"] * (3 + len(rates))))
-    for metric, of_lines in estimates.items():
-        name = {"discounted_return": "training", "greedy_return": "greedy"}[metric]
-        for (algorithm, setting), of_rates in of_lines.items():
-            cells = (_interval_cell(of_rates.get(rate)) for rate in rates)
-            parts.append(_row(name, ALGORITHMS[algorithm].label, setting, *cells))
-    return "\n".join(parts) + "\n"
+def draw_pareto(records: Sequence[Record], metric: str) -> "Figure":
+    """Return over decisions a second: a row a rate, a column a task, a point a setting; three or more are joined."""
+    tasks, lines = tasks_of(records), lines_of(records)
+    rates = sorted({rate_of(record) for record in records})
+    figure, axes = _panels(len(rates), len(tasks))
+    for row, rate in zip(axes, rates, strict=True):
+        for ax, task in zip(row, tasks, strict=True):
+            here = [record for record in records if record["task"] == task and rate_of(record) == rate]
+            decisions = {line: float(np.mean(of[rate])) for line, of in by_line(here, task, "decision_rate_hz").items()}
+            returns = {line: mean_and_interval(of[rate]) for line, of in by_line(here, task, metric).items()}
+            for algorithm in dict.fromkeys(line[0] for line in lines):
+                swept = sorted((decisions[line], *returns[line]) for line in returns if line[0] == algorithm)
+                if swept:
+                    x, y, half_width = np.array(swept).T
+                    row_of = ALGORITHMS[algorithm]
+                    style: dict[str, Any] = {"fmt": "o-" if len(swept) > 2 else "o", "color": row_of.colour, "linewidth": 0.8}
+                    ax.errorbar(x, y, half_width, label=row_of.label, markersize=4, capsize=2, **style)
+            ax.set_xscale("log")
+            ax.set_xticks(_DECISION_RATES, [str(tick) for tick in _DECISION_RATES])
+            ax.minorticks_off()
+            ax.set_xlim(0.8, 700.0)
+            ax.set_visible(bool(returns))  # A task that has a rate of its own has nothing at others'.
+            means = [0.0, *(value for value, _ in returns.values())]
+            ax.set_ylim(min(means) - 0.04 * max(*means, 0.1), 1.15 * max(*means, 0.1))
+            ax.set_title(f"{find_task(task).label}, {rate} Hz")
+        row[0].set_ylabel("discounted return")
+    for ax in axes[-1]:
+        ax.set_xlabel("decisions a second")
+    _legend(figure, f"a point a setting; 95 % interval (Student's t) of {seeds_in_words(records)}")
+    return figure
 
 
-def plot(
-    sources: Sequence[Path], output: Path, algorithms: Sequence[str] | None = None, settings: Sequence[str] | None = None
-) -> list[Path]:
-    """Draw everything that studies' folders, or CSV files of their records, have the data for.
+def draw_profiles(records: Sequence[Record], scores: dict[Line, dict[int, np.ndarray]]) -> "Figure":
+    """Performance profiles: the share of runs, over tasks and seeds, whose score is above a threshold; a panel a rate."""
+    from rliable.library import create_performance_profile
 
-    :param sources: folders or files; the learning curves of a file are in the one beside it
-    :param output: folder for figures (PNG and SVG) and ``table.md``
-    :param algorithms: only these; all by default
-    :param settings: likewise; ``best`` is the best action repeat
-    :return: the files written
-    :raises ValueError: if nothing is left
-    """
-    import matplotlib as mpl
-
-    mpl.use("Agg")
-    import matplotlib.pyplot as plt
-
-    from sb3_ctco.study import scores
-
-    by = list(algorithms or ALGORITHMS)
-
-    def chosen(rows: Sequence[Record]) -> list[Record]:
-        return [row for row in rows if row["algorithm"] in by and (settings is None or row["setting"] in settings)]
-
-    # Text as text, and the same bytes for the same records.
-    mpl.rcParams.update({"svg.fonttype": "none", "svg.hashsalt": "sb3-ctco"})
-    everything = _merged(sources)
-    records = chosen(scores.with_equal_repeats(everything))
-    if not records:
-        raise ValueError(f"no record has an algorithm of {algorithms} and a setting of {settings}: {lines_of(everything)}")
-    output.mkdir(parents=True, exist_ok=True)
-    estimates = {metric: interquartile_means(records, metric) for metric in ("discounted_return", "greedy_return")}
-    relative = scores.relative_scores(records, "discounted_return")
-    figures = {
-        "frequency": draw_metric(records, "discounted_return"),
-        "frequency_greedy": draw_metric(records, "greedy_return"),
-        "decision_rates": draw_metric(records, "decision_rate_hz"),
-        "interquartile_means": draw_interquartile_means(records, estimates),
-        "pareto": scores.draw_pareto([row for row in everything if row["algorithm"] in by], "discounted_return"),
-    }
-    if relative:
-        figures["profiles"] = scores.draw_profiles(records, relative)
-        figures["improvement"] = scores.draw_improvement(records, relative)
-    # A run that is in several sources is one run.
-    of_runs = {(*key(point), point["seconds"]): point for source in sources for point in read_curves(source)}
-    if points := chosen(list(of_runs.values())):
-        figures["learning_curves"] = draw_learning_curves(points)
-    written = []
-    for name, figure in figures.items():
-        for ending, metadata in (("png", None), ("svg", {"Date": None})):
-            written.append(output / f"{name}.{ending}")
-            figure.savefig(written[-1], dpi=120, metadata=metadata)
-        plt.close(figure)
-    written.append(output / "table.md")
-    written[-1].write_text(table(records, estimates) + scores.averaged_table(relative), encoding="utf-8")
-    return written
-
-
-def _merged(sources: Sequence[Path]) -> list[Record]:
-    """The records of all sources, each run once.
-
-    :raises ValueError: if a run is there with different settings, or if runs of different lengths would make one mean
-    """
-    merged: dict[tuple[Any, ...], Record] = {}
-    lengths: dict[tuple[Any, ...], Record] = {}
-    for source in sources:
-        for record in read_records(source):
-            there = merged.setdefault(key(record), record)
-            refuse_other_fingerprint(there["fingerprint"], record["fingerprint"], key(record), source)
-            of_mean = lengths.setdefault((record["task"], _line_of(record), _rate(record)), record)
-            if of_mean["task_seconds"] != record["task_seconds"]:
-                raise ValueError(
-                    f"{source} has runs of preset {record['preset']} with {record['task_seconds']:g} s of task time, and "
-                    f"preset {of_mean['preset']} has {of_mean['task_seconds']:g} s: they make no mean, plot one of them"
+    rates = sorted({rate for of_rates in scores.values() for rate in of_rates})
+    lines = list(scores)
+    thresholds = np.linspace(0.0, 1.2, 61)
+    figure, axes = _panels(1, len(rates))
+    for ax, rate in zip(axes[0], rates, strict=True):
+        for line in lines:
+            if rate not in scores[line]:
+                continue
+            style, label = _style(line, lines)
+            several = len(scores[line][rate]) > 1
+            with repeatable():
+                profiles, bands = create_performance_profile(
+                    {"": scores[line][rate]}, thresholds, reps=BOOTSTRAP_REPETITIONS if several else 1
                 )
-    return list(merged.values())
+            ax.plot(thresholds, profiles[""], label=label, linewidth=1.2, **style)
+            if several:
+                ax.fill_between(thresholds, *bands[""], color=style["color"], alpha=0.12, linewidth=0)
+        ax.set_title(f"{rate} Hz")
+        ax.set_xlabel("score x")
+        ax.set_ylim(0.0, 1.02)
+    axes[0][0].set_ylabel("share of runs above x")
+    _legend(figure, f"score: return by the best mean at any rate; bands: 95 %, bootstrap over {seeds_in_words(records)}")
+    return figure
 
 
-def _rate(record: Record) -> int:
-    return round(1.0 / record["dt"])
-
-
-def _seeds(records: Sequence[Record]) -> str:
-    """How many seeds there are of a task, algorithm, setting and rate, in words."""
-    counts = Counter((r["task"], r["algorithm"], r["setting"], r["dt"]) for r in records).values()
-    fewest, most = min(counts), max(counts)
-    return f"{most} seed{'s' * (most > 1)}" if fewest == most else f"{fewest} to {most} seeds"
-
-
-def _line_of(record: Record) -> Line:
-    return record["algorithm"], record["setting"]
+def draw_improvement(records: Sequence[Record], scores: dict[Line, dict[int, np.ndarray]]) -> "Figure":
+    """Probability that a seed of the first line beats one of another, over rates; and the scores averaged over rates."""
+    lines = list(scores)
+    first, others = lines[0], improvement(scores, lines[0])
+    figure, axes = _panels(1, 2)
+    left, right = axes[0]
+    for line, of_rates in others.items():
+        style, label = _style(line, lines)
+        value, low, high = np.array(list(of_rates.values())).T
+        x = _apart(list(of_rates), line, lines)
+        left.errorbar(x, value, (value - low, high - value), label=label, marker="o", markersize=4, capsize=2, **style)
+    left.axhline(0.5, color="0.6", linewidth=0.8)
+    left.set_ylim(-0.02, 1.02)
+    _rate_axis(left, records)
+    left.set_title(f"probability that {_style(first, lines)[1]} is better")
+    averaged = frequency_averaged(scores)
+    for place, (line, (value, low, high)) in enumerate(reversed(averaged.items())):
+        right.errorbar(
+            value, place, xerr=[[value - low], [high - value]], fmt="o", color=ALGORITHMS[line[0]].colour, capsize=2
+        )
+    right.set_yticks(range(len(averaged)), [_style(line, lines)[1] for line in reversed(averaged)], fontsize="small")
+    right.set_ylim(-0.5, max(len(averaged), 1) - 0.5)
+    right.set_xlim(left=0.0)
+    right.set_title("score averaged over rates")
+    right.set_xlabel("return by the best at any rate")
+    _legend(figure, f"interquartile means, 95 % intervals: stratified bootstrap over {seeds_in_words(records)}")
+    return figure
 
 
 def _panels(n_rows: int, n_columns: int) -> tuple["Figure", np.ndarray]:
@@ -404,7 +360,7 @@ def _return_axis(ax: "Axes", shown: Sequence[float]) -> None:
 
 
 def _rate_axis(ax: "Axes", records: Sequence[Record]) -> None:
-    rates = sorted({_rate(record) for record in records})
+    rates = sorted({rate_of(record) for record in records})
     ax.set_xscale("log")
     ax.set_xticks(rates, [str(rate) for rate in rates])
     ax.minorticks_off()
@@ -417,21 +373,3 @@ def _legend(figure: "Figure", title: str) -> None:
     entries = {label: handle for of_panel in shown for handle, label in of_panel}
     place: dict[str, Any] = {"loc": "outside lower center", "ncols": 4, "fontsize": "small", "title_fontsize": "small"}
     figure.legend(list(entries.values()), list(entries), title=title, **place)
-
-
-def _row(*cells: str) -> str:
-    return f"| {' | '.join(cells)} |"
-
-
-def _cell(values: Sequence[float]) -> str:
-    if not values:
-        return "–"
-    mean, half_width = mean_and_interval(values)
-    return f"{mean:.2f}" if math.isnan(half_width) else f"{mean:.2f} ± {half_width:.2f}"
-
-
-def _interval_cell(estimate: tuple[float, float, float] | None) -> str:
-    if estimate is None:
-        return "–"
-    mean, low, high = estimate
-    return f"{mean:.2f}" if math.isnan(low) else f"{mean:.2f} [{low:.2f}, {high:.2f}]"

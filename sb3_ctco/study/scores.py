@@ -1,38 +1,84 @@
-"""Comparisons over all tasks, of returns divided by the best one: profiles, probability of improvement, mean over rates."""
+"""What figures and tables show: means over seeds, and comparisons over all tasks, with their intervals."""
 
-from collections import defaultdict
-from collections.abc import Callable, Sequence
-from typing import TYPE_CHECKING, Any
+import contextlib
+import itertools
+import math
+from collections import Counter, defaultdict
+from collections.abc import Callable, Iterator, Sequence
 
 import numpy as np
 
-from sb3_ctco.registry import ALGORITHMS, find_task
-from sb3_ctco.study import plots
-from sb3_ctco.study.plots import (
-    Line,
-    _apart,
-    _interval_cell,
-    _legend,
-    _line_of,
-    _panels,
-    _rate,
-    _rate_axis,
-    _row,
-    _seeds,
-    _style,
-    by_line,
-    lines_of,
-    mean_and_interval,
-    tasks_of,
-)
+from sb3_ctco.options import DEFAULT_DISCOUNT_RATE
+from sb3_ctco.registry import ALGORITHMS, TASKS
 from sb3_ctco.study.records import Record
 
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure
-
-_DECISION_RATES = (1, 2, 5, 10, 20, 50, 100, 200, 500)
 #: What a step held for so many steps is called in a preset, and the line of the best of them
 STEPS, BEST = "steps", "best"
+#: Resamples of the bootstrap, as many as rliable's authors take for figures
+BOOTSTRAP_REPETITIONS = 2000
+
+#: An algorithm and its setting, which is a line of a figure
+Line = tuple[str, str]
+#: Interquartile mean with lower and upper bound, by line, then by rate in Hz
+Estimates = dict[Line, dict[int, tuple[float, float, float]]]
+
+
+def rate_of(record: Record) -> int:
+    """The interaction rate, in Hz."""
+    return round(1.0 / record["dt"])
+
+
+def line_of(record: Record) -> Line:
+    """The line of a figure that a record is of."""
+    return record["algorithm"], record["setting"]
+
+
+def lines_of(records: Sequence[Record]) -> list[Line]:
+    """Algorithms and settings that occur, in a fixed order; the paper's settings come after others."""
+    present = {line_of(record) for record in records}
+    return sorted(present, key=lambda line: (list(ALGORITHMS).index(line[0]), line[1] == "paper", line[1]))
+
+
+def tasks_of(records: Sequence[Record]) -> list[str]:
+    """Tasks that occur: the paper's in its order, and then others."""
+    present = {record["task"] for record in records}
+    return [*(task for task in TASKS if task in present), *sorted(present - set(TASKS))]
+
+
+def seeds_in_words(records: Sequence[Record]) -> str:
+    """How many seeds there are of a task, algorithm, setting and rate, in words."""
+    counts = Counter((r["task"], r["algorithm"], r["setting"], r["dt"]) for r in records).values()
+    fewest, most = min(counts), max(counts)
+    return f"{most} seed{'s' * (most > 1)}" if fewest == most else f"{fewest} to {most} seeds"
+
+
+def by_line(records: Sequence[Record], task: str, metric: str) -> dict[Line, dict[int, list[float]]]:
+    """A metric of one task, by algorithm and setting, then by rate in Hz: one value a seed."""
+    lines: dict[Line, dict[int, list[float]]] = {line: defaultdict(list) for line in lines_of(records)}
+    for record in records:
+        if record["task"] == task:
+            lines[line_of(record)][rate_of(record)].append(record[metric])
+    return {line: dict(sorted(rates.items())) for line, rates in lines.items() if rates}
+
+
+def mean_and_interval(values: Sequence[float]) -> tuple[float, float]:
+    """Mean over seeds, and half the width of its 95 % interval (Student's t; nan for one seed)."""
+    from scipy.stats import t
+
+    n = len(values)
+    half_width = float(t.ppf(0.975, n - 1)) * float(np.std(values, ddof=1)) / math.sqrt(n) if n > 1 else math.nan
+    return float(np.mean(values)), half_width
+
+
+@contextlib.contextmanager
+def repeatable() -> Iterator[None]:
+    """The same intervals each time: rliable draws from NumPy's global generator."""
+    state = np.random.get_state()
+    np.random.seed(0)
+    try:
+        yield
+    finally:
+        np.random.set_state(state)
 
 
 def with_equal_repeats(records: Sequence[Record]) -> list[Record]:
@@ -51,35 +97,56 @@ def with_equal_repeats(records: Sequence[Record]) -> list[Record]:
     kept += [{**record, "setting": name} for record in sac if (name := f"{1000 * record['dt']:g}ms") in held]
     cells: dict[tuple[str, int], dict[str, list[Record]]] = defaultdict(lambda: defaultdict(list))
     for record in [*sac, *(record for record in repeats if record["setting"] not in held)]:
-        cells[record["task"], _rate(record)][record["setting"]].append(record)
+        cells[record["task"], rate_of(record)][record["setting"]].append(record)
     for of_setting in cells.values():
         best = max(of_setting.values(), key=lambda group: float(np.mean([one["discounted_return"] for one in group])))
         kept += [{**record, "setting": BEST} for record in best]
     return kept
 
 
+def complete_seeds(records: Sequence[Record], metric: str, tasks: Sequence[str]) -> dict[Line, dict[int, np.ndarray]]:
+    """A metric of the seeds that are complete in all of some tasks, by line, then by rate in Hz: ``[n_seeds, n_tasks]``."""
+    values = {(line_of(record), rate_of(record), record["seed"], record["task"]): record[metric] for record in records}
+    seeds, rates = sorted({record["seed"] for record in records}), sorted({rate_of(record) for record in records})
+    matrices: dict[Line, dict[int, np.ndarray]] = {}
+    for line, rate in itertools.product(lines_of(records), rates):
+        of_seeds = [[values.get((line, rate, seed, task)) for task in tasks] for seed in seeds]
+        if rows := [row for row in of_seeds if None not in row]:
+            matrices.setdefault(line, {})[rate] = np.array(rows)
+    return matrices
+
+
+def interquartile_means(records: Sequence[Record], metric: str) -> Estimates:
+    """Interquartile means over seeds and tasks with their 95 % intervals, from rliable.
+
+    Scores are returns times the paper's τ, 0.404/s, that is fractions of the most that a reward of 1 a second can give. A rate
+    needs at least one seed that is complete in all tasks.
+    """
+    from rliable.metrics import aggregate_iqm
+
+    return {
+        line: {rate: _estimate(aggregate_iqm, matrix * DEFAULT_DISCOUNT_RATE) for rate, matrix in of_rates.items()}
+        for line, of_rates in complete_seeds(records, metric, tasks_of(records)).items()
+    }
+
+
 def relative_scores(records: Sequence[Record], metric: str) -> dict[Line, dict[int, np.ndarray]]:
     """Returns divided by the best mean over seeds at any rate, for each task where that is positive.
 
-    :return: by line, then by rate in Hz, ``[n_seeds, n_tasks]``, of the seeds that are complete in all tasks
+    :return: by line, then by rate in Hz, ``[n_seeds, n_tasks]``, of the seeds that are complete in all these tasks
     """
-    tasks = tasks_of(records)
     best = {
         task: max(float(np.mean(values)) for rates in by_line(records, task, metric).values() for values in rates.values())
-        for task in tasks
+        for task in tasks_of(records)
     }
     # What costs have no share of what can be had.
-    tasks = [task for task in tasks if best[task] > 0]
-    values = {(_line_of(record), _rate(record), record["seed"], record["task"]): record[metric] for record in records}
-    scores: dict[Line, dict[int, np.ndarray]] = {}
-    for line in lines_of(records):
-        for rate in sorted({_rate(record) for record in records}):
-            seeds = sorted({key[2] for key in values if key[:2] == (line, rate)})
-            complete = [seed for seed in seeds if all((line, rate, seed, task) in values for task in tasks)]
-            if complete and tasks:
-                matrix = [[values[line, rate, seed, task] / best[task] for task in tasks] for seed in complete]
-                scores.setdefault(line, {})[rate] = np.array(matrix)
-    return scores
+    best = {task: value for task, value in best.items() if value > 0}
+    if not best:
+        return {}
+    matrices = complete_seeds(records, metric, list(best))
+    return {
+        line: {rate: matrix / [*best.values()] for rate, matrix in of_rates.items()} for line, of_rates in matrices.items()
+    }
 
 
 def frequency_averaged(scores: dict[Line, dict[int, np.ndarray]]) -> dict[Line, tuple[float, float, float]]:
@@ -128,107 +195,8 @@ def _estimate(function: Callable[..., float], *matrices: np.ndarray) -> tuple[fl
     if min(map(len, matrices)) < 2:
         return value, float("nan"), float("nan")
     given = matrices[0] if len(matrices) == 1 else list(matrices)
-    with plots.repeatable():
+    with repeatable():
         _, intervals = get_interval_estimates(
-            {"": given}, lambda *resampled: np.array([function(*resampled)]), reps=plots._BOOTSTRAP_REPETITIONS
+            {"": given}, lambda *resampled: np.array([function(*resampled)]), reps=BOOTSTRAP_REPETITIONS
         )
     return value, float(intervals[""][0, 0]), float(intervals[""][1, 0])
-
-
-def draw_pareto(records: Sequence[Record], metric: str) -> "Figure":
-    """Return over decisions a second: a row a rate, a column a task, a point a setting; three or more are joined."""
-    tasks, lines = tasks_of(records), lines_of(records)
-    rates = sorted({_rate(record) for record in records})
-    figure, axes = _panels(len(rates), len(tasks))
-    for row, rate in zip(axes, rates, strict=True):
-        for ax, task in zip(row, tasks, strict=True):
-            here = [record for record in records if record["task"] == task and _rate(record) == rate]
-            decisions = {line: float(np.mean(of[rate])) for line, of in by_line(here, task, "decision_rate_hz").items()}
-            returns = {line: mean_and_interval(of[rate]) for line, of in by_line(here, task, metric).items()}
-            for algorithm in dict.fromkeys(line[0] for line in lines):
-                swept = sorted((decisions[line], *returns[line]) for line in returns if line[0] == algorithm)
-                if swept:
-                    x, y, half_width = np.array(swept).T
-                    row_of = ALGORITHMS[algorithm]
-                    style: dict[str, Any] = {"fmt": "o-" if len(swept) > 2 else "o", "color": row_of.colour, "linewidth": 0.8}
-                    ax.errorbar(x, y, half_width, label=row_of.label, markersize=4, capsize=2, **style)
-            ax.set_xscale("log")
-            ax.set_xticks(_DECISION_RATES, [str(tick) for tick in _DECISION_RATES])
-            ax.minorticks_off()
-            ax.set_xlim(0.8, 700.0)
-            ax.set_visible(bool(returns))  # A task that has a rate of its own has nothing at others'.
-            means = [0.0, *(value for value, _ in returns.values())]
-            ax.set_ylim(min(means) - 0.04 * max(*means, 0.1), 1.15 * max(*means, 0.1))
-            ax.set_title(f"{find_task(task).label}, {rate} Hz")
-        row[0].set_ylabel("discounted return")
-    for ax in axes[-1]:
-        ax.set_xlabel("decisions a second")
-    _legend(figure, f"a point a setting; 95 % interval (Student's t) of {_seeds(records)}")
-    return figure
-
-
-def draw_profiles(records: Sequence[Record], scores: dict[Line, dict[int, np.ndarray]]) -> "Figure":
-    """Performance profiles: the share of runs, over tasks and seeds, whose score is above a threshold; a panel a rate."""
-    from rliable.library import create_performance_profile
-
-    rates = sorted({rate for of_rates in scores.values() for rate in of_rates})
-    lines = list(scores)
-    thresholds = np.linspace(0.0, 1.2, 61)
-    figure, axes = _panels(1, len(rates))
-    for ax, rate in zip(axes[0], rates, strict=True):
-        for line in lines:
-            if rate not in scores[line]:
-                continue
-            style, label = _style(line, lines)
-            several = len(scores[line][rate]) > 1
-            with plots.repeatable():
-                profiles, bands = create_performance_profile(
-                    {"": scores[line][rate]}, thresholds, reps=plots._BOOTSTRAP_REPETITIONS if several else 1
-                )
-            ax.plot(thresholds, profiles[""], label=label, linewidth=1.2, **style)
-            if several:
-                ax.fill_between(thresholds, *bands[""], color=style["color"], alpha=0.12, linewidth=0)
-        ax.set_title(f"{rate} Hz")
-        ax.set_xlabel("score x")
-        ax.set_ylim(0.0, 1.02)
-    axes[0][0].set_ylabel("share of runs above x")
-    _legend(figure, f"score: return by the best mean at any rate; bands: 95 %, bootstrap over {_seeds(records)}")
-    return figure
-
-
-def draw_improvement(records: Sequence[Record], scores: dict[Line, dict[int, np.ndarray]]) -> "Figure":
-    """Probability that a seed of the first line beats one of another, over rates; and the scores averaged over rates."""
-    lines = list(scores)
-    first, others = lines[0], improvement(scores, lines[0])
-    figure, axes = _panels(1, 2)
-    left, right = axes[0]
-    for line, of_rates in others.items():
-        style, label = _style(line, lines)
-        value, low, high = np.array(list(of_rates.values())).T
-        x = _apart(list(of_rates), line, lines)
-        left.errorbar(x, value, (value - low, high - value), label=label, marker="o", markersize=4, capsize=2, **style)
-    left.axhline(0.5, color="0.6", linewidth=0.8)
-    left.set_ylim(-0.02, 1.02)
-    _rate_axis(left, records)
-    left.set_title(f"probability that {_style(first, lines)[1]} is better")
-    averaged = frequency_averaged(scores)
-    for place, (line, (value, low, high)) in enumerate(reversed(averaged.items())):
-        right.errorbar(
-            value, place, xerr=[[value - low], [high - value]], fmt="o", color=ALGORITHMS[line[0]].colour, capsize=2
-        )
-    right.set_yticks(range(len(averaged)), [_style(line, lines)[1] for line in reversed(averaged)], fontsize="small")
-    right.set_ylim(-0.5, max(len(averaged), 1) - 0.5)
-    right.set_xlim(left=0.0)
-    right.set_title("score averaged over rates")
-    right.set_xlabel("return by the best at any rate")
-    _legend(figure, f"interquartile means, 95 % intervals: stratified bootstrap over {_seeds(records)}")
-    return figure
-
-
-def averaged_table(scores: dict[Line, dict[int, np.ndarray]]) -> str:
-    """Markdown: scores averaged over rates."""
-    rows = [_row("algorithm", "setting", "score"), _row("---", "---", "---")]
-    for (algorithm, setting), estimate in frequency_averaged(scores).items():
-        rows.append(_row(ALGORITHMS[algorithm].label, setting, _interval_cell(estimate)))
-    caption = "Interquartile mean, over tasks and seeds, of the mean over rates of return by the best mean return at any rate."
-    return "\n".join(["\n## Averaged over rates\n", caption, "", *rows, ""])
