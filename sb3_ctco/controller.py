@@ -185,9 +185,9 @@ class OptionController:
             )
         self.policy = _as_policy(policy, deterministic, vec_normalize)
         trained = self.policy.option_space
-        #: What options mean here: training's settings, at this controller's ``dt``.
-        self.settings = trained if dt is None else replace(trained, dt=dt)
-        self._trajectory = self.settings.trajectory
+        #: What options mean here: training's, at this controller's ``dt``.
+        self.option_space = trained if dt is None else replace(trained, dt=dt)
+        self._trajectory = self.option_space.trajectory
         self._box = ActionBox(self.policy.primitive_action_space.low, self.policy.primitive_action_space.high)
         self._middle = self._box.actions(np.zeros((1, self._box.low.size)))[0]
         #: The last two actions where no option runs, ``[n or 1, 2, *action_shape]``; None if they are not known
@@ -211,7 +211,7 @@ class OptionController:
     @property
     def dt(self) -> float:
         """Time between two ticks, in s."""
-        return self.settings.dt
+        return self.option_space.dt
 
     def reset(
         self, which: Sequence[int] | npt.NDArray[Any] | None = None, last_action: npt.NDArray[Any] | None = None
@@ -341,14 +341,14 @@ class OptionController:
         return command
 
     def _at(self, observation: Observation | None, now: float) -> np.ndarray:
-        dt = self.settings.dt
+        dt = self.option_space.dt
         due = [i for i, e in enumerate(self._executions) if now - e.start >= (e.n_steps - 0.5) * dt]
         # Without an observation an option holds its last action, as it does past its end at a late tick.
         if observation is not None or not self._executions:
             self._renew(observation, due, [round((now - e.start) / dt) for e in self._executions], now)
         self._now = now
         # The action that an option leaves from is that of the tick before it.
-        n_before = self.settings.n_before
+        n_before = self.option_space.n_before
         lead = dt if n_before else 0.0
         phases = np.array([min((now - e.start + lead) / (len(e.plan) * dt), 1.0) for e in self._executions])
         features = self._trajectory.joined_basis(phases, n_before) if n_before else self._trajectory.basis(phases)
@@ -369,9 +369,9 @@ class OptionController:
 
     def _decide(self, observation: Observation, due: list[int], now: float) -> None:
         if not self._executions:
-            several = self.settings.joined and self._are_several(observation)
+            several = self.option_space.joined and self._are_several(observation)
             n = len(_first_leaf(observation)) if several else 1
-            options = self._ask(observation, self._firsts(n) if self.settings.joined else [], several)
+            options = self._ask(observation, self._firsts(n) if self.option_space.joined else [], several)
             self._several = options.ndim == 2
             options = np.atleast_2d(options)
             self._executions = [self._begin(*both, now) for both in zip(options, self._firsts(len(options)), strict=True)]
@@ -397,10 +397,10 @@ class OptionController:
             if i in due or n_ran - e.checked < self._check_steps:
                 continue
             e.checked = n_ran
-            if len(e.plan) - n_ran < shortest_steps(self.settings):
+            if len(e.plan) - n_ran < shortest_steps(self.option_space):
                 continue
-            before = self._before(e.sent) if self.settings.joined else None
-            rests.append(self.settings.closest(self._box.normalise(e.plan[n_ran:]), before)[0])
+            before = self._before(e.sent) if self.option_space.joined else None
+            rests.append(self.option_space.closest(self._box.normalise(e.plan[n_ran:]), before)[0])
             asked.append(i)
         if not asked:
             return due
@@ -416,7 +416,7 @@ class OptionController:
 
     def _as_seen(self, observation: Observation, sent: list[np.ndarray], several: bool) -> Observation:
         """Observations as the policy sees them."""
-        if not self.settings.joined:
+        if not self.option_space.joined:
             return observation
         before = np.stack([self._before(actions) for actions in sent])
         seen: Observation = with_last_action(self.policy.observation_space, observation, before if several else before[0])
@@ -424,7 +424,7 @@ class OptionController:
 
     def _before(self, sent: np.ndarray) -> np.ndarray:
         """What an option leaves from, by the last two actions before it."""
-        return self.settings.before(self._box.normalise(sent))[0]
+        return self.option_space.before(self._box.normalise(sent))[0]
 
     def _are_several(self, observation: Observation) -> bool:
         space: Any = self.policy.observation_space
@@ -437,8 +437,8 @@ class OptionController:
         option = np.clip(option.astype(np.float64), -1.0, 1.0)
         if not np.isfinite(option).all():
             raise ValueError(f"the policy returned an option that is not finite: {option}")
-        omega, n_steps = self.settings.decode(option)
-        start = self.settings.first_points(self._before(sent), n_steps) if self.settings.joined else None
+        omega, n_steps = self.option_space.decode(option)
+        start = self.option_space.first_points(self._before(sent), n_steps) if self.option_space.joined else None
         plan = self._box.actions(self._trajectory.plan(omega, n_steps, start))
         # Features sum to one, so that actions are the same combination of weights in their own units.
         weights = self._box.scale(omega.T if start is None else np.vstack([start, omega.T]))
@@ -455,13 +455,13 @@ class OptionController:
     @property
     def duration(self) -> Any:
         """How long the running option takes, in s: a number, or an array ``[n]``."""
-        return self._for_each([e.n_steps * self.settings.dt for e in self._running()])
+        return self._for_each([e.n_steps * self.option_space.dt for e in self._running()])
 
     @property
     def elapsed(self) -> Any:
         """How long it had been running at the last tick, in s; 0 if it was chosen then: a number, or an array ``[n]``."""
         if self._now is None:
-            return self._for_each([(e.tick - 1) * self.settings.dt for e in self._running()])
+            return self._for_each([(e.tick - 1) * self.option_space.dt for e in self._running()])
         return self._for_each([self._now - e.start for e in self._running()])
 
     @property
@@ -476,7 +476,7 @@ class OptionController:
             raise ValueError("no option runs: call the controller with an observation first")
         # The safe action is being sent. Whoever logs goes on.
         nan: Any = math.nan
-        nothing = np.full(self._box.low.size * self.settings.arguments["n_rbf"] + 1, nan, np.float32)
+        nothing = np.full(self._box.low.size * self.option_space.arguments["n_rbf"] + 1, nan, np.float32)
         n = len(self._first) if self._several and self._first is not None else 1
         return [_Execution(nothing, nan, nothing, nothing, nothing, start=nan)] * n
 

@@ -12,8 +12,7 @@ from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.type_aliases import PolicyPredictor
 from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv, unwrap_vec_normalize
 
-from sb3_ctco.options import DEFAULT_DISCOUNT_RATE, ActionBox, discount, step_weight
-from sb3_ctco.vec_env import PENDING
+from sb3_ctco.options import DEFAULT_DISCOUNT_RATE, PENDING, ActionBox, discount, step_weight
 
 
 def mean_absolute_jerk(actions: npt.ArrayLike, dt: float) -> float:
@@ -100,7 +99,7 @@ def _find_discount_rate(env: VecEnv, given: float | None) -> float:
     """
     if not env.has_attr("option_space"):
         return DEFAULT_DISCOUNT_RATE if given is None else given
-    rates = [settings.discount_rate for settings in env.get_attr("option_space")]
+    rates = [space.discount_rate for space in env.get_attr("option_space")]
     expected = rates[0] if given is None else given
     if not np.allclose(rates, expected, rtol=1e-6, atol=0.0):
         raise ValueError(

@@ -10,10 +10,7 @@ from stable_baselines3.common.vec_env import SubprocVecEnv
 from stable_baselines3.common.vec_env.base_vec_env import VecEnvIndices, VecEnvObs, VecEnvStepReturn
 from stable_baselines3.common.vec_env.subproc_vec_env import _stack_obs
 
-from sb3_ctco.options import PLAYED
-
-#: Key of the infos of environments whose option runs on
-PENDING = "option_pending"
+from sb3_ctco.options import PENDING, PLAYED
 
 
 class AsyncOptionVecEnv(SubprocVecEnv):

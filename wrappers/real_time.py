@@ -9,7 +9,7 @@ from typing import Any, Literal, Protocol, SupportsFloat, runtime_checkable
 import gymnasium as gym
 from gymnasium.utils import RecordConstructorArgs
 
-from sb3_ctco.options import LAST_ACTION, TAKEN_OVER
+from sb3_ctco.options import INTERRUPTED, LAST_ACTION, OBSERVATION_AGE, TAKEN_OVER
 from sb3_ctco.safety import Guard, Safety
 from sb3_ctco.wrappers.checks import reset_env
 from sb3_ctco.wrappers.timing import find_dt
@@ -178,12 +178,12 @@ class RealTimeWrapper(gym.Wrapper, RecordConstructorArgs):
         else:
             obs, reward, terminated, truncated, info = self.env.step(action)
             self._wait()
-        self._observed_at = self.clock.now() - info.get("observation_age", 0.0)
+        self._observed_at = self.clock.now() - info.get(OBSERVATION_AGE, 0.0)
         info = {**info, "real_time": {"lateness": lateness}}
         if self.guard is not None:
             info = {LAST_ACTION: action, **info}
         if replaced:
-            info |= {"interrupted": True, TAKEN_OVER: True}
+            info |= {INTERRUPTED: True, TAKEN_OVER: True}
         return obs, reward, terminated, truncated, info
 
     def close(self) -> None:

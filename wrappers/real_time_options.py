@@ -14,6 +14,7 @@ from stable_baselines3.common.env_util import unwrap_wrapper
 
 from sb3_ctco.option_array import plain
 from sb3_ctco.options import (
+    INTERRUPTED,
     LAST_ACTION,
     PLAYED,
     TAKEN_OVER,
@@ -156,7 +157,7 @@ class RealTimeOptionWrapper(OptionExecutionWrapper):
         info = result[4]
         if self._is_lost:
             info[TAKEN_OVER] = True
-        elif info.get("interrupted", False) and not self._ahead_steps:
+        elif info.get(INTERRUPTED, False) and not self._ahead_steps:
             option, residual = self.option_space.closest(self._box.normalise(self.played), before)
             if residual <= self.sub_option_tolerance:
                 info[PLAYED] = option
@@ -192,7 +193,7 @@ class RealTimeOptionWrapper(OptionExecutionWrapper):
             plan = np.full_like(plan[:1], np.nan)
         # Something must happen between two decisions, and what is lost is not for later.
         n_now = max(len(plan) - self._ahead_steps, 1 if rest is None or self._is_lost else 0)
-        over = rest is not None and (rest[2] or rest[3] or rest[4].get("interrupted", False))
+        over = rest is not None and (rest[2] or rest[3] or rest[4].get(INTERRUPTED, False))
         if rest is not None and (over or n_now == 0):
             result = rest
         else:
@@ -200,7 +201,7 @@ class RealTimeOptionWrapper(OptionExecutionWrapper):
             if rest is not None:
                 result[4][ON_THE_WAY] = [*rest[4][ON_THE_WAY], *result[4][ON_THE_WAY]]
                 result = (result[0], [*rest[1], *result[1]], *result[2:])  # type: ignore[misc]
-            over = result[2] or result[3] or result[4].get("interrupted", False)
+            over = result[2] or result[3] or result[4].get(INTERRUPTED, False)
         # The environment may return the same array once more.
         self._decided_on = deepcopy(result[0])
         self._played, self._commands = np.array(self._commands), []
@@ -238,10 +239,10 @@ class RealTimeOptionWrapper(OptionExecutionWrapper):
             if self.n_sub_options:
                 # All of them, because those of a rest are chosen after it.
                 on_the_way.append(deepcopy(obs))
-            if terminated or truncated or info.get("interrupted"):
+            if terminated or truncated or info.get(INTERRUPTED):
                 break
             if self._interrupt is not None and self._is_interrupted(obs, actions, len(rewards), steps_before):
-                info = {**info, "interrupted": True}
+                info = {**info, INTERRUPTED: True}
                 break
         return obs, rewards, terminated, truncated, {**info, ON_THE_WAY: on_the_way}
 

@@ -9,7 +9,7 @@ import numpy as np
 from gymnasium.utils import RecordConstructorArgs
 
 from sb3_ctco.datasets import RecordedTrajectory
-from sb3_ctco.options import LAST_ACTION, TAKEN_OVER, stack
+from sb3_ctco.options import INTERRUPTED, LAST_ACTION, TAKEN_OVER, stack
 from sb3_ctco.wrappers.checks import reset_env
 from sb3_ctco.wrappers.timing import find_dt
 
@@ -68,7 +68,7 @@ class TakeOverWrapper(gym.Wrapper, RecordConstructorArgs):
         if self._next_action is None or terminated or truncated:
             self.hand_over(terminated, truncated)
         if (self._next_action is None) != (other is None):
-            info = {**info, "interrupted": True}
+            info = {**info, INTERRUPTED: True}
         return obs, reward, terminated, truncated, info
 
     def hand_over(self, terminated: bool = False, truncated: bool = False) -> None:

@@ -13,6 +13,7 @@ from stable_baselines3.common.vec_env import VecNormalize
 
 from sb3_ctco.options import (
     DEFAULT_DISCOUNT_RATE,
+    PENDING,
     REWARD_UNITS,
     TAKEN_OVER,
     ActionBox,
@@ -26,7 +27,6 @@ from sb3_ctco.options import (
     sub_options,
     with_last_action,
 )
-from sb3_ctco.vec_env import PENDING
 
 
 class AddedTrajectory(NamedTuple):

@@ -16,7 +16,7 @@ from stable_baselines3.common.callbacks import (
 )
 from stable_baselines3.common.type_aliases import MaybeCallback
 
-from sb3_ctco.vec_env import PENDING
+from sb3_ctco.options import PENDING
 
 
 def eval_callbacks(callback: BaseCallback | None) -> Iterator[EvalCallback]:

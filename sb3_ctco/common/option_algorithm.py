@@ -48,6 +48,7 @@ from sb3_ctco.common.load_arguments import check_load_arguments
 from sb3_ctco.option_array import OptionArray
 from sb3_ctco.options import (
     OPTIONS_OF_0_1_0,
+    PLAYED,
     DurationScale,
     Join,
     OptionSpace,
@@ -55,7 +56,7 @@ from sb3_ctco.options import (
     Trajectory,
     discount_rate_from_gamma,
 )
-from sb3_ctco.vec_env import PLAYED, AsyncOptionVecEnv
+from sb3_ctco.vec_env import AsyncOptionVecEnv
 from sb3_ctco.wrappers import OptionExecutionWrapper, find_dt
 
 #: Of how many decisions logs tell at most
@@ -250,7 +251,7 @@ class OptionOffPolicyAlgorithm(OffPolicyAlgorithm):
         return env
 
     def _check_env(self, env: VecEnv) -> OptionSpace:
-        """The options' settings of an environment, once they agree with the algorithm's."""
+        """The options' space of an environment, once they agree with the algorithm's."""
         normalizer = unwrap_vec_normalize(env)
         if normalizer is not None and normalizer.norm_reward:
             raise ValueError(
@@ -270,7 +271,7 @@ class OptionOffPolicyAlgorithm(OffPolicyAlgorithm):
                         "runs on in AsyncOptionVecEnv: use SubprocVecEnv, or a Gymnasium wrapper inside"
                     )
                 wrapper = wrapper.venv
-        settings = self._check_settings(env)
+        space = self._check_settings(env)
         self.primitive_action_space = env.get_attr("primitive_action_space")[0]
         self.reward_unit = env.get_attr("reward_unit")[0]
         if env.get_attr("overrides_dt")[0]:
@@ -278,7 +279,7 @@ class OptionOffPolicyAlgorithm(OffPolicyAlgorithm):
             self._dt_was_given = True
         # No setting that both must share, but what one wants of the other.
         env.env_method("set_n_sub_options", self.n_sub_options)
-        return settings
+        return space
 
     def _check_settings(self, env: VecEnv) -> OptionSpace:
         """The options' settings of an environment, once options mean the same in it as to the algorithm."""
@@ -417,8 +418,8 @@ class OptionOffPolicyAlgorithm(OffPolicyAlgorithm):
         self.discount_rate = discount_rate_from_gamma(self.gamma, self.gamma_dt)
         self.replay_buffer_kwargs = {"reward_scale": 1.0, **self.replay_buffer_kwargs, "discount_rate": self.discount_rate}
         if self.env is not None:
-            settings = self._check_env(self.env)
-            self.dt, self.d_min = settings.dt, settings.d_min
+            space = self._check_env(self.env)
+            self.dt, self.d_min = space.dt, space.d_min
         super()._setup_model()
         self._tell_buffer()
         self._warn_of_a_large_buffer()

@@ -221,13 +221,13 @@ class FiGARSAC(SoftOptionActorCritic):
         return env
 
     def _check_env(self, env: VecEnv) -> OptionSpace:
-        settings = super()._check_env(env)
-        if not np.isclose(settings.d_min, settings.dt, rtol=1e-6, atol=0.0):
+        space = super()._check_env(env)
+        if not np.isclose(space.d_min, space.dt, rtol=1e-6, atol=0.0):
             raise ValueError(
-                f"the environment's options have d_min={settings.d_min}, but FiGARSAC's shortest repetition is one step, "
-                f"dt={settings.dt}: pass d_min=0 to OptionExecutionWrapper"
+                f"the environment's options have d_min={space.d_min}, but FiGARSAC's shortest repetition is one step, "
+                f"dt={space.dt}: pass d_min=0 to OptionExecutionWrapper"
             )
-        return settings
+        return space
 
     def _setup_model(self) -> None:
         # The user's stay as they were, so that a file can be loaded with them.

@@ -16,15 +16,13 @@ R              ``integrated_reward``                        reward rate × s
 ============== ============================================ ========================
 """
 
+from sb3_ctco.options.infos import INTERRUPTED, LAST_ACTION, OBSERVATION_AGE, PENDING, PLAYED, TAKEN_OVER, OptionInfo
 from sb3_ctco.options.interrupts import ValueInterrupt
-from sb3_ctco.options.joins import LAST_ACTION, OBSERVATION, with_last_action, with_last_action_space
+from sb3_ctco.options.joins import OBSERVATION, with_last_action, with_last_action_space
 from sb3_ctco.options.semi_mdp import (
     DEFAULT_DISCOUNT_RATE,
-    PLAYED,
     REWARD_UNITS,
-    TAKEN_OVER,
     FloatArray,
-    OptionInfo,
     RewardUnit,
     discount,
     discount_rate_from_gamma,
@@ -49,10 +47,13 @@ from sb3_ctco.options.trajectory import TRAJECTORIES, BezierCurve, RadialBasis, 
 __all__ = [
     "DEFAULT_DISCOUNT_RATE",
     "DURATION_SCALES",
+    "INTERRUPTED",
     "JOINS",
     "LAST_ACTION",
     "OBSERVATION",
+    "OBSERVATION_AGE",
     "OPTIONS_OF_0_1_0",
+    "PENDING",
     "PLAYED",
     "REWARD_UNITS",
     "TAKEN_OVER",

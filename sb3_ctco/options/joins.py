@@ -11,10 +11,9 @@ from typing import Any
 import numpy as np
 from gymnasium import spaces
 
+from sb3_ctco.options.infos import LAST_ACTION
 from sb3_ctco.options.semi_mdp import FloatArray
 
-#: Its entry in a dictionary of observations, and in the info of a ``reset`` that tells it
-LAST_ACTION = "last_action"
 #: The entry of what was no dictionary and no vector
 OBSERVATION = "observation"
 

@@ -5,7 +5,7 @@ Pure functions of numpy arrays; equations are those of Karimi et al. 2023, https
 
 import math
 from functools import lru_cache
-from typing import Literal, TypedDict
+from typing import Literal
 
 import numpy as np
 import numpy.typing as npt
@@ -13,27 +13,6 @@ import numpy.typing as npt
 FloatArray = npt.NDArray[np.floating]
 RewardUnit = Literal["rate", "impulse"]
 REWARD_UNITS: tuple[RewardUnit, ...] = ("rate", "impulse")
-
-
-#: Key under which the info of an option that ended tells its option vector, where that is not the action of this step
-PLAYED = "option_played"
-#: Key of the infos of steps in which something else was sent than the policy's action: no transitions of the policy
-TAKEN_OVER = "taken_over"
-
-
-class OptionInfo(TypedDict):
-    """What ran of an option: ``info["option"]``.
-
-    :param duration: time that ran, in s
-    :param n_steps: primitive steps that ran
-    :param integrated_reward: R, in reward rate × s
-    :param discount: γ(d) = e^(−τ·duration)
-    """
-
-    duration: float
-    n_steps: int
-    integrated_reward: float
-    discount: float
 
 
 def discount_rate_from_gamma(gamma: float = 0.98, gamma_dt: float = 0.05) -> float:
