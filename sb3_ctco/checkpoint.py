@@ -47,7 +47,7 @@ def save_checkpoint(model: BaseAlgorithm, path: str | pathlib.Path) -> None:
     except (TypeError, AttributeError, pickle.PicklingError) as error:
         raise ValueError(f"the state of the environments cannot be saved: {error}") from error
     state = {
-        "algorithm": _name(type(model)),
+        "algorithm": type(model).__qualname__,
         "model": archive.getvalue(),
         "attributes": {name: getattr(model, name) for name in _BEGUN_ANEW if hasattr(model, name)},
         "replay_buffer": getattr(model, "replay_buffer", None),
@@ -77,9 +77,9 @@ def load_checkpoint(
     """
     with pathlib.Path(path).open("rb") as file:
         state = pickle.load(file)
-    saved_by = state.get("algorithm", _name(algorithm))
-    if saved_by != _name(algorithm):
-        raise ValueError(f"{path} is a checkpoint of {saved_by}: load it with that class, not with {_name(algorithm)}")
+    saved_by = state.get("algorithm", algorithm.__qualname__)
+    if saved_by != algorithm.__qualname__:
+        raise ValueError(f"{path} is a checkpoint of {saved_by}: load it with that class, not with {algorithm.__qualname__}")
     model = algorithm.load(io.BytesIO(state["model"]), env=env, device=device, force_reset=False)
     for name, value in state["attributes"].items():
         setattr(model, name, value)
@@ -99,10 +99,6 @@ def load_checkpoint(
         vars(layer).update(one["attributes"])
     _set_generators(model, vec_env, state["generators"])
     return model
-
-
-def _name(algorithm: type[BaseAlgorithm]) -> str:
-    return f"{algorithm.__module__}.{algorithm.__qualname__}"
 
 
 def _layers(env: VecEnv) -> Iterator[VecEnv]:

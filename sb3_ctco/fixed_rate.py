@@ -118,22 +118,40 @@ class FixedRateSAC(SAC):
 
     def _setup_model(self) -> None:
         if self.env is not None:
-            self._check_env(self.env)
+            self.option_space, self.reward_scale = self._clock_of(self.env)
         super()._setup_model()
         if self.pink_noise is not None:
             self.actor.action_dist = self.pink_noise
 
-    def set_env(self, env: GymEnv, force_reset: bool = True) -> None:
-        """Stable-Baselines3's ``set_env``, for an environment that is wrapped as the model's was."""
-        env = self._wrap_env(env, self.verbose)
-        self._check_env(env)
-        super().set_env(env, force_reset)
+    def wrap_env(self, env: gym.Env) -> gym.Env:
+        """Wrap a bare environment as the model's own is wrapped, for instance to evaluate in it."""
+        space = self.option_space
+        assert space is not None  # since there was an environment
+        if self.updates_per_step is not None:
+            return hold_actions(
+                env, space.d_max, space.arguments["n_rbf"], space.d_min < space.d_max, space.dt, space.discount_rate
+            )
+        if unwrap_wrapper(env, Monitor) is None:
+            env = Monitor(env)
+        return RewardRateWrapper(env, space.dt, space.discount_rate, self.reward_scale or 1.0)
 
-    def _check_env(self, env: VecEnv) -> None:
+    def set_env(self, env: GymEnv, force_reset: bool = True) -> None:
+        """Stable-Baselines3's ``set_env``; a bare environment is wrapped as the model's own.
+
+        :raises ValueError: if one that is wrapped already counts time or rewards otherwise
+        """
+        if self.option_space is not None and not isinstance(env, VecEnv) and not env.has_wrapper_attr("option_space"):
+            env = self.wrap_env(env)
+        env = self._wrap_env(env, self.verbose)
+        clock = self._clock_of(env)
+        super().set_env(env, force_reset)
+        self.option_space, self.reward_scale = clock
+
+    def _clock_of(self, env: VecEnv) -> tuple[OptionSpace, float | None]:
         if not env.has_attr("option_space"):
             raise ValueError(
-                "the environment must be wrapped as sac_at_rate wraps it, in RewardRateWrapper(env, dt, discount_rate, "
-                "reward_scale), or by hold_actions: pass model.get_env(), or one that is made likewise"
+                "the environment must be wrapped as sac_at_rate wraps it: load the model without env and call set_env(env), "
+                "which wraps one that is bare"
             )
         (space, *_), scale = env.get_attr("option_space"), None
         if env.has_attr("reward_scale"):
@@ -145,7 +163,7 @@ class FixedRateSAC(SAC):
             if differences:
                 found = ", ".join(f"{name}={there} in place of {here}" for name, (here, there) in differences.items())
                 raise ValueError(f"the environment is another one than this model learned in: it has {found}")
-        self.option_space, self.reward_scale = space, scale
+        return space, scale
 
     def _init_callback(self, callback: MaybeCallback, progress_bar: bool = False) -> BaseCallback:
         self._n_seen = self.num_timesteps
@@ -160,7 +178,8 @@ class FixedRateSAC(SAC):
             return
         self._updates_due += self.updates_per_step * (self.num_timesteps - max(self._n_seen, self.learning_starts))
         self._n_seen = self.num_timesteps
-        if self._updates_due >= 1:
+        assert self.replay_buffer is not None
+        if self._updates_due >= 1 and self.replay_buffer.size():
             super().train(int(self._updates_due), batch_size)
             self._updates_due %= 1
 

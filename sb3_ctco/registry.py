@@ -4,7 +4,6 @@ A new algorithm is its folder and a row in :data:`ALGORITHMS`; a new task is a r
 task without one.
 """
 
-import inspect
 import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
@@ -16,6 +15,7 @@ from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv, VecNormalize, sync_envs_normalization
 
+from sb3_ctco.common.load_arguments import constructor_parameters
 from sb3_ctco.common.option_algorithm import OptionOffPolicyAlgorithm
 from sb3_ctco.ctco import CTCO
 from sb3_ctco.dac_ppo import DACPPO
@@ -138,7 +138,7 @@ class Algorithm:
         if "rollout_seconds" in given and not episode_seconds > 0:
             raise ValueError(f"{where} has rollout_seconds, whole episodes of a task that has no longest one: pass n_steps")
         arguments = self.in_steps(dict(given), dt, episode_seconds)
-        known = {name for constructor in self.constructors for name in inspect.signature(constructor).parameters}
+        known = {name for constructor in self.constructors for name in constructor_parameters(constructor)}
         unknown = sorted(set(arguments) - known | set(arguments) & _SAID_BY_THE_STUDY)
         if unknown:
             raise ValueError(f"{where} has no arguments {unknown}")

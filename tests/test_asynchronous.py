@@ -25,7 +25,7 @@ from stable_baselines3 import DQN, PPO, SAC
 from stable_baselines3.common.callbacks import BaseCallback, CheckpointCallback
 from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 
-from sb3_ctco import CTCO, FiGARSAC, OptionExecutionWrapper
+from sb3_ctco import CTCO, FiGARSAC, OptionExecutionWrapper, sac_at_rate
 from sb3_ctco.realtime import AsynchronousTrainer, JournalError, JournalReader, JournalWriter, LearnerError, Transition
 from sb3_ctco.realtime import trainer as trainer_module
 from sb3_ctco.realtime.weights import SharedWeights
@@ -67,6 +67,9 @@ def make_model(algorithm, env, **kwargs):
     return algorithm(
         "MlpPolicy", env, learning_starts=40, batch_size=16, policy_kwargs={"net_arch": [16]}, seed=0, device="cpu", **kwargs
     )
+
+
+SMALL = {"batch_size": 16, "policy_kwargs": {"net_arch": [16]}, "seed": 0, "device": "cpu"}
 
 
 def records_of(folder):
@@ -242,6 +245,22 @@ def test_resuming_what_means_something_else_is_refused(collected, algorithm, cha
     env = Point()
     with pytest.raises(ValueError, match=f"means something else: .*{message}.*begin in another folder"):
         AsynchronousTrainer(make_model(algorithm, env, **changes), env, folder, resume=True)
+
+
+def test_what_rewards_mean_is_kept_and_asked_of_a_journal(collected):
+    env = OptionExecutionWrapper(Point(), reward_unit="impulse")
+    with pytest.raises(ValueError, match=r"means something else: options=.*'reward_unit': 'impulse'"):
+        AsynchronousTrainer(make_model(CTCO, env), Point(), collected[0], resume=True, real_time=False)
+
+
+def test_a_sac_of_a_fixed_rate_has_its_rewards_weighed(tmp_path):
+    model = sac_at_rate(Point(), 0.02, learning_starts_seconds=0.5, **SMALL)
+    trainer = AsynchronousTrainer(model, Point(), tmp_path, real_time=False)
+    assert trainer.model.get_env().get_attr("reward_scale") == [model.reward_scale]
+    assert model.get_env().get_attr("option_space") == [model.option_space]
+    held = sac_at_rate(Point(), 0.02, hold_seconds=0.1, **SMALL)
+    with pytest.raises(ValueError, match="has no use for a SAC that holds its actions"):
+        AsynchronousTrainer(held, Point(), tmp_path / "held", real_time=False)
 
 
 def test_resuming_after_damage_says_what_was_dropped(collected, tmp_path, caplog):

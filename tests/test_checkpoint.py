@@ -112,7 +112,7 @@ def test_a_sac_of_a_fixed_rate(random_walk_env, tmp_path, kwargs):
     model = load_checkpoint(FixedRateSAC, path, env, device="cpu").learn(70, reset_num_timesteps=False)
     assert (model.num_timesteps, model._n_updates) == (steps, updates)
     th.testing.assert_close(parameters(), expected, rtol=0.0, atol=0.0)
-    with pytest.raises(ValueError, match=r"a checkpoint of sb3_ctco\.fixed_rate\.FixedRateSAC: load it with that class"):
+    with pytest.raises(ValueError, match=r"a checkpoint of FixedRateSAC: load it with that class"):
         load_checkpoint(SAC, path, env)
 
 

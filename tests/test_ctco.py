@@ -726,6 +726,9 @@ def test_a_dt_that_the_wrapper_was_given_is_the_models(random_walk_env):
     """The environment says 0.1 s."""
     model = make(OptionExecutionWrapper(random_walk_env(), dt=0.05))
     assert model.wrap_env(random_walk_env()).option_space.dt == 0.05
+    nonsense = random_walk_env()
+    nonsense.dt = lambda: "later"
+    assert OptionExecutionWrapper(nonsense, dt=0.05).option_space.dt == 0.05
     # What was found is found again.
     faster = random_walk_env()
     faster.dt = 0.05

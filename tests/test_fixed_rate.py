@@ -20,7 +20,7 @@ from sb3_ctco import fixed_rate as module
 from sb3_ctco.evaluation import DiscountedReturnCallback, evaluate_discounted_return
 from sb3_ctco.fixed_rate import FixedRateSAC, QuickSACPolicy, hold_actions, update_schedule
 from sb3_ctco.options import DEFAULT_DISCOUNT_RATE
-from sb3_ctco.wrappers import reward_rate
+from sb3_ctco.wrappers import TakeOverWrapper, reward_rate
 
 SMALL = {"policy_kwargs": {"net_arch": [8]}, "batch_size": 8, "device": "cpu", "seed": 0}
 
@@ -312,14 +312,35 @@ def test_the_quick_policy_is_the_same_sac(random_walk_env, hold):
 
 def test_an_environment_of_another_clock_is_refused(scripted_env):
     model = sac_at_rate(scripted_env(dt=0.1), 0.1, **SMALL)
-    with pytest.raises(ValueError, match="wrapped as sac_at_rate wraps it"):
-        model.set_env(scripted_env(dt=0.1))
+    clock = model.option_space, model.reward_scale
     scale = model.get_env().get_attr("reward_scale")[0]
     with pytest.raises(ValueError, match=r"it has d_max=.*dt=0\.05 in place of 0\.1"):
         model.set_env(RewardRateWrapper(scripted_env(), dt=0.05, reward_scale=scale))
     with pytest.raises(ValueError, match=r"it has reward_scale=1\.0 in place of "):
         model.set_env(RewardRateWrapper(scripted_env(), dt=0.1))
+    other_spaces = scripted_env(dt=0.1)
+    other_spaces.observation_space = spaces.Box(-1, 1, (3,))
+    with pytest.raises(ValueError, match="Observation spaces do not match"):
+        model.set_env(other_spaces)
+    assert (model.option_space, model.reward_scale) == clock
     model.set_env(RewardRateWrapper(scripted_env(), dt=0.1, reward_scale=scale))
+
+
+@pytest.mark.parametrize("kwargs", [{}, {"hold_seconds": 0.3}, {"hold_seconds": 0.3, "n_rbf": 2}], ids=str)
+def test_a_bare_environment_is_wrapped_as_the_models_was(scripted_env, tmp_path, kwargs):
+    model = sac_at_rate(scripted_env(dt=0.1), 0.1, **kwargs, **SMALL)
+    model.save(tmp_path / "model")
+    loaded = FixedRateSAC.load(tmp_path / "model", device="cpu")
+    loaded.set_env(scripted_env(dt=0.1))
+    for one in (loaded.get_env(), loaded.wrap_env(scripted_env(dt=0.1))):
+        assert str(one.envs[0] if one is loaded.get_env() else one) == str(model.get_env().envs[0])
+    loaded.learn(20)
+
+
+def test_a_held_sac_whose_warm_up_somebody_else_played(random_walk_env):
+    env = TakeOverWrapper(random_walk_env(), lambda obs: np.zeros(1, np.float32), lambda trajectory: None)
+    model = sac_at_rate(env, 0.1, hold_seconds=0.3, learning_starts_seconds=1.0, **SMALL).learn(60)
+    assert model.replay_buffer.size() == 0
 
 
 def test_the_quick_policy_knows_one_observation_from_several():

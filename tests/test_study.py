@@ -20,6 +20,7 @@ import yaml
 from conftest import PATIENCE
 from rliable.metrics import aggregate_iqm, probability_of_improvement
 
+from sb3_ctco import CTCO, registry
 from sb3_ctco.evaluation import evaluate_discounted_return
 from sb3_ctco.registry import ALGORITHMS as ALGORITHM_ROWS
 from sb3_ctco.registry import TASKS, Task, find_task
@@ -1050,3 +1051,15 @@ def test_an_id_of_one_rate_has_episodes_as_long_as_it_says():
     assert find_task("Pendulum-v1").seconds_of_episode(20) == 10.0
     with pytest.raises(ValueError, match=r"has rollout_seconds, whole episodes of a task that has no longest one"):
         ALGORITHM_ROWS["dac_ppo"].arguments({"rollout_seconds": 40}, 0.05, 0.0, "dac_ppo (mine)")
+
+
+def test_a_subclass_has_its_bases_arguments_in_a_preset():
+    class Mine(CTCO):
+        def __init__(self, *args, alpha=0.1, **kwargs):
+            super().__init__(*args, **kwargs)
+
+    row = registry.Algorithm("mine", "mine", "C4", **registry._of_options(Mine))
+    given = {"gamma": 0.98, "gamma_dt": 0.05, "updates_per_second": 20, "alpha": 0.2, "n_rbf": 2}
+    assert row.arguments(given, 0.02, 10.0, "a preset") == given
+    with pytest.raises(ValueError, match=r"a preset has no arguments \['beta'\]"):
+        row.arguments({**given, "beta": 1}, 0.02, 10.0, "a preset")

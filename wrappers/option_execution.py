@@ -1,5 +1,6 @@
 """Play options, smooth action trajectories of variable duration, in an environment with a fixed step."""
 
+import contextlib
 import itertools
 import math
 from collections.abc import Sequence
@@ -99,6 +100,9 @@ class OptionExecutionWrapper(gym.Wrapper, RecordConstructorArgs):
 
     action_space: spaces.Box  # type: ignore[assignment, override]
 
+    #: Whether ``dt`` was given and is another than what the environment tells of itself
+    overrides_dt = False
+
     def __init__(
         self,
         env: gym.Env,
@@ -154,9 +158,12 @@ class OptionExecutionWrapper(gym.Wrapper, RecordConstructorArgs):
             raise ValueError(f"reward_unit must be one of {REWARD_UNITS}, not {reward_unit!r}")
         if not sub_option_tolerance >= 0:
             raise ValueError(f"sub_option_tolerance must be at least 0, not {sub_option_tolerance}")
-        dt, told = find_dt(env, required_by="OptionExecutionWrapper") if dt is None else dt, find_dt(env)
-        #: Whether ``dt`` is another than what the environment tells of itself
-        self.overrides_dt = told is not None and not math.isclose(told, dt, rel_tol=1e-6)
+        if dt is None:
+            dt = find_dt(env, required_by="OptionExecutionWrapper")
+        else:
+            with contextlib.suppress(Exception):  # An environment may tell nonsense, which a given dt corrects.
+                told = find_dt(env)
+                self.overrides_dt = told is not None and not math.isclose(told, dt, rel_tol=1e-6)
         shortest, longest = default_durations(discount_rate)
         d_min = max(shortest, dt) if d_min is None else d_min or dt
         d_max = longest if d_max is None else d_max

@@ -4,7 +4,7 @@ import inspect
 import io
 import math
 import pathlib
-from collections.abc import Collection
+from collections.abc import Callable, Collection
 from typing import Any
 
 from stable_baselines3.common.base_class import BaseAlgorithm
@@ -48,8 +48,10 @@ def check_load_arguments(
     return {"_stats_window_size" if name == "stats_window_size" else name: value for name, value in arguments.items()}
 
 
-def constructor_parameters(algorithm: type[BaseAlgorithm]) -> dict[str, inspect.Parameter]:
-    """What an algorithm's constructor takes by name, with what a subclass hands on to its base as ``**kwargs``."""
+def constructor_parameters(algorithm: Callable[..., BaseAlgorithm]) -> dict[str, inspect.Parameter]:
+    """What makes an algorithm takes by name: a function, or a class with what it hands on to its base as ``**kwargs``."""
+    if not isinstance(algorithm, type):
+        return dict(inspect.signature(algorithm).parameters)
     found: dict[str, inspect.Parameter] = {}
     for cls in algorithm.__mro__:
         if "__init__" not in vars(cls):

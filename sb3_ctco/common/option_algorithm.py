@@ -271,15 +271,17 @@ class OptionOffPolicyAlgorithm(OffPolicyAlgorithm):
                         "runs on in AsyncOptionVecEnv: use SubprocVecEnv, or a Gymnasium wrapper inside"
                     )
                 wrapper = wrapper.venv
-        space = self._check_settings(env)
+        return self._check_settings(env)
+
+    def _adopt_env(self, env: VecEnv) -> None:
+        """Take over what an environment that was checked says, and tell it what is wanted of it."""
         self.primitive_action_space = env.get_attr("primitive_action_space")[0]
         self.reward_unit = env.get_attr("reward_unit")[0]
         if env.get_attr("overrides_dt")[0]:
             # The user's word to the wrapper
             self._dt_was_given = True
-        # No setting that both must share, but what one wants of the other.
         env.env_method("set_n_sub_options", self.n_sub_options)
-        return space
+        self._tell_buffer()
 
     def _check_settings(self, env: VecEnv) -> OptionSpace:
         """The options' settings of an environment, once options mean the same in it as to the algorithm."""
@@ -317,7 +319,7 @@ class OptionOffPolicyAlgorithm(OffPolicyAlgorithm):
         env = self._wrap_env(self._as_option_env(env), self.verbose)
         self._check_env(env)
         super().set_env(env, force_reset)
-        self._tell_buffer()
+        self._adopt_env(env)
 
     @classmethod
     def load(
@@ -422,6 +424,8 @@ class OptionOffPolicyAlgorithm(OffPolicyAlgorithm):
             self.dt, self.d_min = space.dt, space.d_min
         super()._setup_model()
         self._tell_buffer()
+        if self.env is not None:
+            self._adopt_env(self.env)
         self._warn_of_a_large_buffer()
 
     def _tell_buffer(self) -> None:

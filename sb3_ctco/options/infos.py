@@ -26,7 +26,7 @@ PENDING = "option_pending"
 INTERRUPTED = "interrupted"
 #: True of a step in which something else was sent than the policy's action: no transition of the policy
 TAKEN_OVER = "taken_over"
-#: What was really sent, in the units of the environment; also the entry of observations that hold it
+#: In infos, what was really sent, in the units of the environment; in observations, what an option leaves from, normalised
 LAST_ACTION = "last_action"
 #: How old an observation is, in s
 OBSERVATION_AGE = "observation_age"

@@ -34,6 +34,7 @@ from sb3_ctco.common.buffers import AddedTrajectory
 from sb3_ctco.common.callbacks import as_callback
 from sb3_ctco.common.option_algorithm import OptionOffPolicyAlgorithm
 from sb3_ctco.datasets import RecordedTrajectory
+from sb3_ctco.fixed_rate import FixedRateSAC
 from sb3_ctco.options import TAKEN_OVER, ValueInterrupt
 from sb3_ctco.realtime.journal import JournalReader, JournalWriter, check_meaning, repair_journal, segments
 from sb3_ctco.realtime.learner import (
@@ -201,6 +202,7 @@ class AsynchronousTrainer(Generic[AlgorithmType]):
             wrapped = RealTimeOptionWrapper.like(
                 model.wrap_env(wrapped), decide_ahead=decide_ahead, interrupt=interrupt, background=real_time
             )
+        # Of its own accord each of these algorithms wraps what is bare; stock SAC takes it as it is.
         model.set_env(wrapped)
         if model.seed is not None:
             model.env.seed(model.seed)  # type: ignore[union-attr]
@@ -415,7 +417,9 @@ class AsynchronousTrainer(Generic[AlgorithmType]):
 
 
 def _given_dt(model: OffPolicyAlgorithm) -> float | None:
-    """The period that the user gave an algorithm of options, in s; None if the environment is to tell it."""
+    """The period that the user gave the algorithm, in s; None if the environment is to tell it."""
+    if isinstance(model, FixedRateSAC) and model.option_space is not None:
+        return model.option_space.dt
     return model.dt if isinstance(model, OptionOffPolicyAlgorithm) and model._dt_was_given else None
 
 
@@ -444,6 +448,8 @@ def _check_model_and_env(model: Any, env: Any) -> None:
             f"pass one bare Gymnasium environment, not {env}: AsynchronousTrainer wraps it itself, with the settings of "
             "the model"
         )
+    if isinstance(model, FixedRateSAC) and model.updates_per_step is not None:
+        raise ValueError("AsynchronousTrainer has no use for a SAC that holds its actions: train CTCO or FiGARSAC with it")
     if not isinstance(model.action_space, spaces.Box):
         raise ValueError(f"AsynchronousTrainer needs continuous actions, not {model.action_space}")
     normalizer = model.get_vec_normalize_env()
@@ -557,7 +563,8 @@ def _meaning(model: OffPolicyAlgorithm) -> dict[str, Any]:
         # A trajectory that is no name is a class, of which JSON keeps the name.
         arguments = model.option_space.arguments
         options = {name: value if isinstance(value, int | float | str) else str(value) for name, value in arguments.items()}
-        options["reward_unit"] = model.reward_unit
+        if model.reward_unit != "rate":
+            options["reward_unit"] = model.reward_unit
     return {
         "algorithm": type(model).__name__,
         "options": options,
