@@ -63,7 +63,8 @@ def main() -> None:
     parser.add_argument("--folder", type=Path, default=Path("runs/visual_reacher"))
     args = parser.parse_args()
     th.set_num_threads(1)
-    env = gym.make(f"sb3_ctco/visual_reacher-{args.difficulty}-v0", dt=1.0 / args.rate)
+    task = {"id": f"sb3_ctco/visual_reacher-{args.difficulty}-v0", "dt": 1.0 / args.rate}
+    env = gym.make(**task)
     n_steps = round(args.minutes * 60.0 * args.rate)
     training = DiscountedReturnCallback()
     if args.asynchronous:
@@ -80,7 +81,7 @@ def main() -> None:
         args.folder.mkdir(parents=True, exist_ok=True)
         model.save(args.folder / "model")
     print("training:", describe(training.episodes[-len(training.episodes) // 10 :]))
-    print("greedy:", describe(evaluate_discounted_return(model, model.wrap_env(env.unwrapped))))
+    print("greedy:", describe(evaluate_discounted_return(model, model.wrap_env(gym.make(**task)))))
 
 
 if __name__ == "__main__":

@@ -197,6 +197,8 @@ class OptionController:
         self._check_steps = sys.maxsize if interrupt is None else steps_in(interrupt.check_period, self.dt)
         self._executions: list[_Execution] = []
         self._several = False
+        #: The time between two ticks by a clock, on average of the latest, in s; dt at least
+        self._usual_tick = self.dt
         self._now: float | None = None
         #: Actions of the ticks up to the next decision or check, and which of them is next
         self._rows: list[np.ndarray] = []
@@ -219,20 +221,38 @@ class OptionController:
         """Forget the options that run, so that the next tick decides anew: at the start of each episode.
 
         :param which: with several observations, those to reset: their indices or a mask; all of them by default
-        :param last_action: the action that is being sent, from which the first option leaves unless the join is free; by
-            default the middle of the box, as in training
+        :param last_action: the action that is being sent, of one or of each of those, from which the first option leaves
+            unless the join is free, and from which changes are limited; by default the middle of the box, as in training
+        :raises ValueError: for the last action of some robots before the first tick: how many there are is not known
         """
-        first = None
+        shape, first = self._box.low.shape, None
         if last_action is not None:
-            first = np.stack([np.asarray(last_action, self._box.low.dtype).reshape(self._box.low.shape)] * 2)
+            actions = np.asarray(last_action, self._box.low.dtype).reshape(-1, *shape)
+            first = np.stack([actions, actions], axis=1)
+        n = len(self._executions) or (0 if self._first is None else len(self._first))
+        if which is not None and first is not None and n == 0:
+            raise ValueError("before the first tick pass the last action of all robots, [n, *action_shape], and no which")
         self.decide_anew(which)
         if which is None:
             self._executions = []
-            self._first = None if first is None else first[None]
+            self._first = first
             self._now = self._sent_at = self._guard = None
+            self._usual_tick = self.dt
             self._observed_at = -math.inf
-        for execution in self._chosen(which):
-            execution.sent = np.stack([self._middle] * 2) if first is None else first
+            return
+        if n == 0:
+            return
+        rows = np.atleast_1d(np.arange(n)[np.asarray(which)])
+        firsts = np.broadcast_to(self._middle if first is None else first, (len(rows), 2, *shape))
+        for i, execution in enumerate(self._chosen(which)):
+            execution.sent = firsts[i]
+        if first is not None:
+            if not self._executions:  # while the safe action is sent
+                self._first = np.array(self._first)
+                self._first[rows] = firsts
+            if self._guard is not None:
+                several = self._guard.low.ndim > len(shape)
+                self._guard.restart(rows if several else ..., firsts[:, 1] if several else firsts[0, 1])
 
     def decide_anew(self, which: Sequence[int] | npt.NDArray[Any] | None = None) -> None:
         """Break the options off that run: the next tick decides anew, on from what is being sent.
@@ -329,7 +349,10 @@ class OptionController:
             self._guard.start(None if self._first is None else np.broadcast_to(self._first[:, 1], shape))
         seconds = self.dt if self._sent_at is None else now - self._sent_at
         self._now = self._sent_at = now
-        command = self._guard.command(actions, seconds, reason=reason)
+        # After a stall a command may not change by all that the time of the stall would allow.
+        counted = min(seconds, 2.0 * self._usual_tick)
+        self._usual_tick = max(self.dt, 0.9 * self._usual_tick + 0.1 * counted)
+        command = self._guard.command(actions, counted, reason=reason)
         if self._guard.is_safe_action:
             # Whatever comes next is decided anew, on from here.
             commands = command.reshape(-1, *low.shape)

@@ -51,9 +51,17 @@ class Guard:
     :param safety: what it does
     :param low: lower bounds of actions
     :param high: upper bounds, likewise
+    :raises ValueError: if changes of actions are limited, which have no width
     """
 
     def __init__(self, safety: Safety, low: np.ndarray, high: np.ndarray):
+        limits = [limit for limit in (safety.max_rate, safety.max_slew) if limit not in (None, math.inf)]
+        if limits and not (np.isfinite(low).all() and np.isfinite(high).all()):
+            raise ValueError(
+                f"max_rate={safety.max_rate} and max_slew={safety.max_slew} count in widths of the box of actions, and from "
+                f"{low} to {high} there is none: give the machine's own action space bounds, or pass "
+                "RealTimeWrapper(env, safety=Safety(max_rate=None, max_slew=None))"
+            )
         self.safety = safety
         self.low, self.high = low, high
         #: How many actions were replaced by the safe one, by reason
@@ -72,6 +80,11 @@ class Guard:
         known = action is not None and np.isfinite(action).all()
         self._sent = np.array(action, np.float64).reshape(self.low.shape) if known else None
         self._rate = np.zeros(self.low.shape)
+
+    def restart(self, rows: Any, actions: np.ndarray) -> None:
+        """Begin anew for some of several machines: these actions are being sent to them, at rest."""
+        if self._sent is not None:
+            self._sent[rows], self._rate[rows] = actions, 0.0
 
     def command(self, action: np.ndarray, seconds: float, age: float = 0.0, reason: str | None = None) -> np.ndarray:
         """What is to be sent.

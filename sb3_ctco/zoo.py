@@ -12,6 +12,7 @@ know them: it checks ``--algo`` before it imports ``--gym-packages``.
 
 import argparse
 import copy
+import importlib
 import sys
 from collections.abc import Sequence
 from importlib import resources
@@ -36,6 +37,7 @@ from sb3_ctco import registry
 from sb3_ctco.common.load_arguments import constructor_parameters
 from sb3_ctco.common.option_algorithm import OptionOffPolicyAlgorithm
 from sb3_ctco.envs.quiet import mute_deprecated_attributes
+from sb3_ctco.wrappers import OptionExecutionWrapper
 
 #: The package's algorithms by their names in the Zoo.
 ALGORITHMS: dict[str, type[BaseAlgorithm]] = {
@@ -122,13 +124,22 @@ class OptionExperimentManager(ExperimentManager):
     def _wrappers(self, hyperparams: dict[str, Any]) -> list[Any]:
         given = hyperparams.get("env_wrapper") or []
         wrappers = list(given) if isinstance(given, list) else [given]
-        if any(WRAPPER in (wrapper if isinstance(wrapper, dict) else [wrapper]) for wrapper in wrappers):
+        if any(map(_plays_options, wrappers)):
             return wrappers
         algorithm = ALGOS[self.algo]
         assert issubclass(algorithm, OptionOffPolicyAlgorithm)
         parameters = constructor_parameters(algorithm)
         arguments = {name: hyperparams.get(name, parameter.default) for name, parameter in parameters.items()}
         return [*wrappers, {WRAPPER: algorithm.wrapper_kwargs(arguments)}]
+
+
+def _plays_options(wrapper: Any) -> bool:
+    """Whether an entry of ``env_wrapper``, a name, a class, or one with arguments, is an OptionExecutionWrapper."""
+    (named,) = wrapper if isinstance(wrapper, dict) else [wrapper]
+    if isinstance(named, str):
+        module, _, name = named.rpartition(".")
+        named = getattr(importlib.import_module(module), name)
+    return isinstance(named, type) and issubclass(named, OptionExecutionWrapper)
 
 
 def register() -> None:

@@ -26,6 +26,7 @@ from stable_baselines3.common.callbacks import BaseCallback, CheckpointCallback
 from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 
 from sb3_ctco import CTCO, FiGARSAC, OptionExecutionWrapper, sac_at_rate
+from sb3_ctco.common.lock import lock
 from sb3_ctco.realtime import AsynchronousTrainer, JournalError, JournalReader, JournalWriter, LearnerError, Transition
 from sb3_ctco.realtime import trainer as trainer_module
 from sb3_ctco.realtime.weights import SharedWeights
@@ -1068,3 +1069,55 @@ def test_demonstrations_of_an_earlier_run_are_an_earlier_run(tmp_path):
     trainer.add_trajectory(np.zeros((31, 3), np.float32), np.zeros((30, 1)), np.zeros(30), False, True, 0.05)
     with pytest.raises(FileExistsError, match="holds the experience of an earlier run: pass resume=True"):
         AsynchronousTrainer(model, gym.make("Pendulum-v1"), tmp_path, real_time=False)
+
+
+def test_a_reset_that_is_interrupted_leaves_the_machine_safe(tmp_path):
+    class Arm(Point):
+        def reset(self, *, seed=None, options=None):
+            raise KeyboardInterrupt
+
+        def send(self, action):
+            raise NotImplementedError
+
+        def receive(self):
+            raise NotImplementedError
+
+    stopped, env = [], Arm()
+    trainer = AsynchronousTrainer(make_model(CTCO, env, buffer_size=100), env, tmp_path, safe_stop=stopped.append)
+    with pytest.raises(KeyboardInterrupt):
+        trainer.learn(10)
+    assert stopped == [env]
+
+
+def test_one_trainer_at_a_time_uses_a_folder(collected):
+    folder, steps = collected
+    env = Point()
+    trainer = AsynchronousTrainer(make_model(CTCO, env), env, folder, resume=True, real_time=False)
+    with lock(folder):
+        with pytest.raises(RuntimeError, match="another AsynchronousTrainer uses"):
+            trainer.learn(steps + 20)
+        with pytest.raises(RuntimeError, match="another AsynchronousTrainer uses"):
+            AsynchronousTrainer(make_model(CTCO, env), env, folder, resume=True, real_time=False)
+
+
+def test_learning_goes_on_from_all_that_was_learned_when_it_was_interrupted(tmp_path):
+    def interrupt(locals_, globals_):
+        if locals_["self"].num_timesteps > 150:
+            raise KeyboardInterrupt
+        return True
+
+    env = Point()
+    model = make_model(CTCO, env, buffer_size=500)
+    with AsynchronousTrainer(model, env, tmp_path, real_time=False, updates_per_second=500) as trainer:
+        with pytest.raises(KeyboardInterrupt):
+            trainer.learn(1000, interrupt)
+        learned = CTCO.load(tmp_path / "model.zip")
+        assert learned._n_updates > 0
+        trainer.learn(model.num_timesteps + 10)
+    start = CTCO.load(tmp_path / "start.zip")
+    th.testing.assert_close(start.get_parameters(), learned.get_parameters(), rtol=0.0, atol=0.0)
+
+
+def test_noise_that_is_a_function_of_the_state_is_refused(tmp_path):
+    with pytest.raises(ValueError, match="use_sde=True is not supported"):
+        AsynchronousTrainer(make_model(SAC, Point(), use_sde=True), Point(), tmp_path, real_time=False)

@@ -325,6 +325,11 @@ def test_dt_that_is_not_found(scripted_env):
 # --- among other wrappers
 
 
+def test_options_of_options_are_refused(scripted_env):
+    with pytest.raises(ValueError, match="plays options already: wrap it once"):
+        wrap(gym.wrappers.TimeLimit(wrap(scripted_env()), 10))
+
+
 class SequenceEnv(gym.Wrapper):
     """Offers step_sequence and counts its calls."""
 

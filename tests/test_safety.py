@@ -10,7 +10,7 @@ from gymnasium import spaces
 from sb3_ctco import OptionController
 from sb3_ctco.options import JOINS, OptionSpace
 from sb3_ctco.safety import Guard, Safety
-from sb3_ctco.wrappers import OptionExecutionWrapper, RealTimeOptionWrapper, RealTimeWrapper
+from sb3_ctco.wrappers import OptionExecutionWrapper, RealTimeOptionWrapper, RealTimeWrapper, TakeOverWrapper
 
 LOW, HIGH = np.array([-1.0, 0.0], np.float32), np.array([1.0, 4.0], np.float32)
 UNLIMITED = {"max_rate": None, "max_slew": None}
@@ -426,3 +426,63 @@ def test_a_guard_never_sends_nan(limits, start, age):
     assert np.isfinite(sent).all()
     assert guard.is_safe_action == np.isnan(age)
     assert sent[-1] == (0.0 if guard.is_safe_action else 0.5)
+
+
+def test_limits_need_bounds():
+    unbounded = np.full(2, np.inf)
+    with pytest.raises(ValueError, match=r"max_rate=10.0 and max_slew=400.0 count in widths of the box"):
+        Guard(Safety(), -unbounded, unbounded)
+    guard = Guard(Safety(**UNLIMITED), -unbounded, unbounded)
+    for action in ([5.0, 6.0], [7.0, 8.0]):
+        np.testing.assert_array_equal(guard.command(np.array(action), 0.1), action)
+
+
+def test_after_a_stall_a_command_changes_by_two_ticks_worth_at_most():
+    policy, controller = make_controller(max_rate=1.0)
+    policy.value = 1.0
+    for k in range(4):
+        assert controller(np.zeros(3), now=0.1 * k)[0] == 1.0
+    policy.value = -1.0
+    assert controller(np.zeros(3), now=0.9)[0] == pytest.approx(1.0 - 2 * 0.1 * 2.0)  # at a width, 2, a second
+    # A loop that is always slower than dt is no stall.
+    policy, controller = make_controller(max_rate=0.1, stale_after=9.0)
+    policy.value = 1.0
+    controller.reset(last_action=[-1.0, 0.0])
+    sent = [controller(np.zeros(3), now=0.5 * k)[0] for k in range(25)]
+    assert np.diff(sent)[:3] == pytest.approx([0.04, 0.044, 0.0484], rel=1e-3)
+    assert np.diff(sent)[14:16] == pytest.approx(0.1, rel=1e-3)
+
+
+def test_one_of_several_robots_begins_from_what_is_sent_to_it():
+    low = [-1.0, 0.0]
+    _, controller = make_controller(max_rate=1.0)
+    with pytest.raises(ValueError, match="before the first tick pass the last action of all robots"):
+        controller.reset([1], last_action=low)
+    obs = np.zeros((3, 3))
+    np.testing.assert_array_equal(controller(obs, now=0.0), [HALF] * 3)
+    controller.reset([1], last_action=low)
+    # In 0.1 s it moves by a tenth of the widths, 2 and 4.
+    np.testing.assert_allclose(controller(obs, now=0.1), [HALF, [-0.8, 0.4], HALF], rtol=1e-6)
+    # The same while the safe action is sent
+    for now in (0.2, 0.3, 0.4):
+        controller(None, now=now)
+    assert controller.replaced
+    before = controller._guard._sent.copy()
+    controller.reset([2], last_action=[1.0, 4.0])
+    np.testing.assert_allclose(controller._guard._sent, [*before[:2], [1.0, 4.0]])
+    assert (controller._first[2] == [1.0, 4.0]).all()
+    # And each from its own, from the beginning
+    controller.reset(last_action=[low, HALF, [1.0, 4.0]])
+    np.testing.assert_allclose(controller(obs, now=9.0), [[-0.8, 0.4], HALF, [0.8, 3.6]], rtol=1e-6)
+
+
+def test_what_was_sent_is_asked_in_the_machines_actions_only():
+    def rescaled(**kwargs):
+        return gym.wrappers.RescaleAction(RealTimeWrapper(Machine(), clock=Clock(), **kwargs), -2.0, 2.0)
+
+    with pytest.raises(ValueError, match=r"join='continuous' needs to know what was sent.*safety=None"):
+        OptionExecutionWrapper(rescaled(), join="continuous")
+    with pytest.raises(ValueError, match="take_over needs to know what was sent"):
+        TakeOverWrapper(rescaled(), lambda obs: None, print)
+    OptionExecutionWrapper(rescaled())
+    OptionExecutionWrapper(rescaled(safety=None), join="continuous")

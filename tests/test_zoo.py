@@ -111,11 +111,14 @@ def test_other_wrappers_of_an_entry_go_inside(tmp_path, models):
     assert type(env.env) is gym.wrappers.FlattenObservation
 
 
-def test_an_option_wrapper_in_the_file_is_left_alone(tmp_path, models):
+@pytest.mark.parametrize(
+    "name", ["wrappers.OptionExecutionWrapper", "OptionExecutionWrapper", "wrappers.RealTimeOptionWrapper"]
+)
+def test_an_option_wrapper_in_the_file_is_left_alone(tmp_path, models, name):
     config = tmp_path / "own.yml"
     config.write_text(
         "Pendulum-v1:\n  n_timesteps: 200\n  policy: MlpPolicy\n  learning_starts: 50\n  n_rbf: 2\n"
-        "  env_wrapper:\n    - sb3_ctco.wrappers.OptionExecutionWrapper:\n        n_rbf: 2\n        reward_unit: impulse\n"
+        f"  env_wrapper:\n    - sb3_ctco.{name}:\n        n_rbf: 2\n        reward_unit: impulse\n"
     )
     main(["train", "--env", "Pendulum-v1", "--conf-file", str(config), "-f", str(tmp_path), *FEW_STEPS])
     assert models[0].get_env().get_attr("reward_unit") == ["impulse"]

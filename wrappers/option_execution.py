@@ -13,6 +13,7 @@ import numpy.typing as npt
 from gymnasium import spaces
 from gymnasium.error import ResetNeeded
 from gymnasium.utils import RecordConstructorArgs
+from stable_baselines3.common.env_util import unwrap_wrapper
 
 from sb3_ctco.option_array import plain
 from sb3_ctco.options import (
@@ -38,6 +39,7 @@ from sb3_ctco.options import (
     with_last_action_space,
 )
 from sb3_ctco.wrappers.checks import check_observation, is_finite, reset_env
+from sb3_ctco.wrappers.real_time import refuse_other_actions
 from sb3_ctco.wrappers.step_sequence import SequenceResult, StepSequence, find_step_sequence
 from sb3_ctco.wrappers.timing import find_dt
 
@@ -136,6 +138,10 @@ class OptionExecutionWrapper(gym.Wrapper, RecordConstructorArgs):
         )
         gym.Wrapper.__init__(self, env)
 
+        if unwrap_wrapper(env, OptionExecutionWrapper) is not None:
+            raise ValueError(f"the environment {env} plays options already: wrap it once")
+        if join != "free":
+            refuse_other_actions(env, f"join={join!r}")
         space = env.action_space
         if not isinstance(space, spaces.Box):
             raise TypeError(

@@ -8,6 +8,7 @@ from typing import Any, Literal, Protocol, SupportsFloat, runtime_checkable
 
 import gymnasium as gym
 from gymnasium.utils import RecordConstructorArgs
+from stable_baselines3.common.env_util import unwrap_wrapper
 
 from sb3_ctco.options import INTERRUPTED, LAST_ACTION, OBSERVATION_AGE, TAKEN_OVER
 from sb3_ctco.safety import Guard, Safety
@@ -214,3 +215,18 @@ class RealTimeWrapper(gym.Wrapper, RecordConstructorArgs):
                 1e3 * s.worst_lateness,
                 1e3 * self.dt,
             )
+
+
+def refuse_other_actions(env: gym.Env, what: str) -> None:
+    """Refuse an environment whose guard tells what it sent in other units than those of the environment's actions.
+
+    :param what: names what needs to know what was sent
+    :raises ValueError: if a wrapper outside a guarded :class:`RealTimeWrapper` has other actions than the machine
+    """
+    real_time = unwrap_wrapper(env, RealTimeWrapper)
+    if isinstance(real_time, RealTimeWrapper) and real_time.guard is not None and env.action_space != real_time.action_space:
+        raise ValueError(
+            f"{what} needs to know what was sent, which the guard tells in the machine's actions, {real_time.action_space}, "
+            f"and actions here are in {env.action_space}: scale them in the machine's send, or pass a RealTimeWrapper with "
+            "safety=None"
+        )

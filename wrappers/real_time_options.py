@@ -220,10 +220,13 @@ class RealTimeOptionWrapper(OptionExecutionWrapper):
         return result
 
     def _finish_rest(self) -> SequenceResult | None:
-        rest, self._rest = self._rest, None
-        playing, self._playing_rest = self._playing_rest, None
-        if playing is not None:
-            return playing.result()
+        rest = self._rest
+        if self._playing_rest is not None:
+            # While this waits, who abandons must find it, and wait as well.
+            result = self._playing_rest.result()
+            self._playing_rest = self._rest = None
+            return result
+        self._rest = None
         return None if rest is None else self._play_until_interrupted(rest)
 
     def _play_until_interrupted(self, actions: np.ndarray, steps_before: int = 0) -> SequenceResult:

@@ -11,6 +11,7 @@ from gymnasium.utils import RecordConstructorArgs
 from sb3_ctco.datasets import RecordedTrajectory
 from sb3_ctco.options import INTERRUPTED, LAST_ACTION, TAKEN_OVER, stack
 from sb3_ctco.wrappers.checks import reset_env
+from sb3_ctco.wrappers.real_time import refuse_other_actions
 from sb3_ctco.wrappers.timing import find_dt
 
 #: ``take_over(observation)``: the action to send in place of the policy's, in the environment's units, or None
@@ -36,6 +37,7 @@ class TakeOverWrapper(gym.Wrapper, RecordConstructorArgs):
     ):
         RecordConstructorArgs.__init__(self, take_over=take_over, record=record, dt=dt, _disable_deepcopy=True)
         gym.Wrapper.__init__(self, env)
+        refuse_other_actions(env, "take_over")
         self.dt = find_dt(env, required_by="TakeOverWrapper") if dt is None else dt
         self.take_over = take_over
         self.record = record

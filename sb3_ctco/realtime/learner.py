@@ -4,6 +4,7 @@ import contextlib
 import logging
 import multiprocessing
 import os
+import select
 import signal
 import sys
 import time
@@ -113,8 +114,10 @@ def run_learner(settings: LearnerSettings, weights: SharedWeights, stop: Any, re
 
     What it reports is ``("ready", None)``, ``("log", {name: value})`` and ``("failed", traceback)``.
     """
-    # Ctrl-C reaches every process of the terminal; the acting one decides what to do about it.
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    # Ctrl-C reaches every process of the terminal, and what ends a service its whole group; the acting one decides what to
+    # do about it.
+    for number in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(number, signal.SIG_IGN)
     os.nice(settings.niceness)
     if settings.n_threads is not None:
         th.set_num_threads(settings.n_threads)
@@ -183,7 +186,9 @@ class _Learner:
             if now - logged_at > _LOG_SECONDS:
                 values = {k: v for k, v in model.logger.name_to_value.items() if isinstance(v, int | float)}
                 values["asynchronous/updates_per_second"] = (self.num_updates - updates_logged) / (now - logged_at)
-                self.report.send(("log", values))
+                # If nobody reads, which a long reset may be the reason of, it is left out: learning must not wait for it.
+                if select.select([], [self.report], [], 0.0)[1]:
+                    self.report.send(("log", values))
                 logged_at, updates_logged = now, self.num_updates
             if now - saved_at > settings.checkpoint_seconds:
                 self.save()

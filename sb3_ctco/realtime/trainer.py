@@ -1,5 +1,6 @@
 """The acting process: keeps the clock, never waits for the learner, and leaves the machine in a safe state."""
 
+import contextlib
 import ctypes
 import logging
 import math
@@ -32,6 +33,7 @@ from stable_baselines3.common.vec_env.base_vec_env import VecEnvObs, VecEnvStepR
 
 from sb3_ctco.common.buffers import AddedTrajectory
 from sb3_ctco.common.callbacks import as_callback
+from sb3_ctco.common.lock import lock
 from sb3_ctco.common.option_algorithm import OptionOffPolicyAlgorithm
 from sb3_ctco.datasets import RecordedTrajectory
 from sb3_ctco.fixed_rate import FixedRateSAC
@@ -217,10 +219,12 @@ class AsynchronousTrainer(Generic[AlgorithmType]):
         self.decision_seconds: deque[float] = deque(maxlen=_MAX_KEPT)
         #: Age in s of the weights that each of them was made with
         self.weight_ages: deque[float] = deque(maxlen=_MAX_KEPT)
+        self._is_unfinished = False
         if resume:
-            for journal in (self._journal_folder, self._demonstration_folder):
-                repair_journal(journal)
-                check_meaning(journal, _meaning(model))
+            with _alone_in(self.folder):
+                for journal in (self._journal_folder, self._demonstration_folder):
+                    repair_journal(journal)
+                    check_meaning(journal, _meaning(model))
             self._load_checkpoint()
             self._count_timesteps()
 
@@ -243,6 +247,7 @@ class AsynchronousTrainer(Generic[AlgorithmType]):
         :return: the model, with everything that the learner learned
         :raises ValueError: if ``total_timesteps`` is negative
         :raises LearnerError: if the learner failed or was killed
+        :raises RuntimeError: if another trainer uses the folder
         :raises OSError: if what was collected cannot be written
         """
         _check_numbers(total_timesteps=total_timesteps)
@@ -250,6 +255,26 @@ class AsynchronousTrainer(Generic[AlgorithmType]):
         remaining = total_timesteps - model.num_timesteps
         if remaining <= 0:
             return model
+        with _alone_in(self.folder):
+            if self._is_unfinished:
+                # What acts has the learner's actor, and critics from before.
+                self._load_checkpoint()
+            self._is_unfinished = True
+            self._learn(total_timesteps, remaining, callback, log_interval, tb_log_name, progress_bar)
+            self._load_checkpoint()
+            self._is_unfinished = False
+        return model
+
+    def _learn(
+        self,
+        total_timesteps: int,
+        remaining: int,
+        callback: MaybeCallback,
+        log_interval: int,
+        tb_log_name: str,
+        progress_bar: bool,
+    ) -> None:
+        model = self.model
         context = multiprocessing.get_context("spawn")
         weights = SharedWeights(acting_module(model), context)
         stop = context.RawValue(ctypes.c_bool, False)
@@ -288,8 +313,6 @@ class AsynchronousTrainer(Generic[AlgorithmType]):
                     stop.value = True
                     link.join()
         link.raise_if_failed()
-        self._load_checkpoint()
-        return model
 
     def _act(
         self,
@@ -448,6 +471,8 @@ def _check_model_and_env(model: Any, env: Any) -> None:
             f"pass one bare Gymnasium environment, not {env}: AsynchronousTrainer wraps it itself, with the settings of "
             "the model"
         )
+    if model.use_sde:
+        raise ValueError("use_sde=True is not supported: its noise would be drawn anew at each step of the machine")
     if isinstance(model, FixedRateSAC) and model.updates_per_step is not None:
         raise ValueError("AsynchronousTrainer has no use for a SAC that holds its actions: train CTCO or FiGARSAC with it")
     if not isinstance(model.action_space, spaces.Box):
@@ -522,6 +547,18 @@ def _check_folder(folder: Path) -> None:
         raise OSError(f"experience cannot be kept in {folder} ({error}): pass a folder that can be written to") from error
 
 
+@contextlib.contextmanager
+def _alone_in(folder: Path) -> Iterator[None]:
+    """Keep others away from what is collected.
+
+    :raises RuntimeError: if another trainer uses it
+    """
+    with lock(folder) as alone:
+        if not alone:
+            raise RuntimeError(f"another AsynchronousTrainer uses {folder}: wait for its end, or pass another folder")
+        yield
+
+
 class _Supervisor(gym.Wrapper):
     """Lets the trainer look at every primitive step, so that it can stop within an option."""
 
@@ -529,6 +566,11 @@ class _Supervisor(gym.Wrapper):
         super().__init__(env)
         self.check: Callable[[], None] | None = None
         self.has_commanded = False
+
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
+        # A machine moves to where it starts.
+        self.has_commanded = self.has_commanded or isinstance(self.env.unwrapped, SupportsSendReceive)
+        return self.env.reset(seed=seed, options=options) if options is not None else self.env.reset(seed=seed)
 
     def step(self, action: Any) -> Any:
         if self.check is not None:
@@ -613,7 +655,11 @@ class _Link:
             )
 
     def join(self) -> None:
-        self.process.join(_STOP_SECONDS)
+        deadline = time.monotonic() + _STOP_SECONDS
+        # The learner does not wait for a reader, but a pipe that is full would not have its last word.
+        while self.process.exitcode is None and time.monotonic() < deadline:
+            if self.report.poll(0.1) and self._read() is None:
+                self.process.join(max(0.0, deadline - time.monotonic()))
         if self.process.exitcode is None:
             self.process.kill()
             self.process.join()

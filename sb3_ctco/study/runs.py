@@ -2,30 +2,29 @@
 
 import contextlib
 import csv
-import errno
 import json
 import os
 import platform
 import subprocess
-import sys
 import time
 import traceback
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from importlib import metadata
 from pathlib import Path
-from typing import IO, Any, Literal
+from typing import Any, Literal
 
 import numpy as np
 import torch as th
 from stable_baselines3.common.base_class import BaseAlgorithm
 
 import sb3_ctco
+from sb3_ctco.common.lock import LOCK, lock
 from sb3_ctco.evaluation import DiscountedReturnCallback, EpisodeStatistics, evaluate_discounted_return
 from sb3_ctco.study.agents import discount_rate, make_eval_env, make_model
 from sb3_ctco.study.grid import Run
 
-SETTINGS, VERSIONS, RECORD, ERROR, LOCK = "settings.json", "versions.json", "record.json", "error.txt", "lock"
+SETTINGS, VERSIONS, RECORD, ERROR = "settings.json", "versions.json", "record.json", "error.txt"
 MONITOR, EVALUATION = "monitor.csv", "evaluation.csv"
 MONITOR_COLUMNS = ("task_seconds", "discounted_return", "decision_rate_hz", "wall_seconds")
 EVALUATION_COLUMNS = ("task_seconds", "discounted_return", "decision_rate_hz", "episode_return")
@@ -114,44 +113,6 @@ def record_failure(run: Run, folder: str | Path, error: Exception) -> Outcome:
     with contextlib.suppress(OSError):
         write_whole(Path(folder) / run.name / ERROR, "".join(traceback.format_exception(error)))
     return Outcome(run.name, "failed", f"{type(error).__name__}: {error}")
-
-
-@contextlib.contextmanager
-def lock(path: Path, patience: float = 0.5) -> Iterator[bool]:
-    """Hold a run's folder for this process; the operating system lets go of it when the process dies.
-
-    :param path: the run's folder
-    :param patience: how long to try, in s: to ask for a run's state holds its lock for a moment
-    :return: whether the folder is ours
-    """
-    with (path / LOCK).open("a") as file:
-        end = time.monotonic() + patience
-        while True:
-            try:
-                _flock(file)
-            except OSError as error:
-                if error.errno not in (errno.EAGAIN, errno.EACCES, errno.EDEADLOCK):
-                    raise
-                if time.monotonic() >= end:
-                    yield False
-                    return
-                time.sleep(0.05)
-            else:
-                yield True
-                return
-
-
-def _flock(file: IO[str]) -> None:
-    """Lock a file as a whole, or raise an ``OSError`` if another process has."""
-    if sys.platform == "win32":
-        import msvcrt
-
-        file.seek(0)
-        msvcrt.locking(file.fileno(), msvcrt.LK_NBLCK, 1)
-    else:
-        import fcntl
-
-        fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
 
 
 def is_running(path: Path) -> bool:
