@@ -197,7 +197,7 @@ class OptionController:
         self._check_steps = sys.maxsize if interrupt is None else steps_in(interrupt.check_period, self.dt)
         self._executions: list[_Execution] = []
         self._several = False
-        #: The time between two ticks by a clock, on average of the latest, in s; dt at least
+        #: The time between two ticks by a clock, on average of the latest ten or so, in s; of the first ones ``dt``
         self._usual_tick = self.dt
         self._now: float | None = None
         #: Actions of the ticks up to the next decision or check, and which of them is next
@@ -222,14 +222,16 @@ class OptionController:
 
         :param which: with several observations, those to reset: their indices or a mask; all of them by default
         :param last_action: the action that is being sent, of one or of each of those, from which the first option leaves
-            unless the join is free, and from which changes are limited; by default the middle of the box, as in training
+            unless the join is free, and changes by a clock are limited; by default options leave from the middle of the box,
+            as in training, and changes go on being limited from what was sent, or after a reset of all from any action
         :raises ValueError: for the last action of some robots before the first tick: how many there are is not known
         """
         shape, first = self._box.low.shape, None
         if last_action is not None:
             actions = np.asarray(last_action, self._box.low.dtype).reshape(-1, *shape)
             first = np.stack([actions, actions], axis=1)
-        n = len(self._executions) or (0 if self._first is None else len(self._first))
+        # What was told of one may be of any number of them.
+        n = len(self._executions) or (0 if self._first is None or len(self._first) == 1 else len(self._first))
         if which is not None and first is not None and n == 0:
             raise ValueError("before the first tick pass the last action of all robots, [n, *action_shape], and no which")
         self.decide_anew(which)
@@ -237,7 +239,6 @@ class OptionController:
             self._executions = []
             self._first = first
             self._now = self._sent_at = self._guard = None
-            self._usual_tick = self.dt
             self._observed_at = -math.inf
             return
         if n == 0:
@@ -246,13 +247,12 @@ class OptionController:
         firsts = np.broadcast_to(self._middle if first is None else first, (len(rows), 2, *shape))
         for i, execution in enumerate(self._chosen(which)):
             execution.sent = firsts[i]
-        if first is not None:
-            if not self._executions:  # while the safe action is sent
-                self._first = np.array(self._first)
-                self._first[rows] = firsts
-            if self._guard is not None:
-                several = self._guard.low.ndim > len(shape)
-                self._guard.restart(rows if several else ..., firsts[:, 1] if several else firsts[0, 1])
+        if not self._executions:  # while the safe action is sent
+            self._first = np.array(self._first)
+            self._first[rows] = firsts
+        if first is not None and self._guard is not None:
+            several = self._guard.low.ndim > len(shape)
+            self._guard.restart(rows if several else ..., firsts[:, 1] if several else firsts[0, 1])
 
     def decide_anew(self, which: Sequence[int] | npt.NDArray[Any] | None = None) -> None:
         """Break the options off that run: the next tick decides anew, on from what is being sent.
@@ -334,7 +334,9 @@ class OptionController:
             self._observed_at = now if observed_at is None else observed_at
         age = now - self._observed_at
         low, high = self._box.low, self._box.high
-        actions, reason = low, None if age <= self.safety.stale_after else "no fresh observation"
+        n = 1 if self._first is None else len(self._first)
+        actions = low if n == 1 else np.broadcast_to(low, (n, *low.shape))
+        reason = None if age <= self.safety.stale_after else "no fresh observation"
         if reason is None:
             try:
                 actions = self._at(observation, now)
@@ -351,7 +353,7 @@ class OptionController:
         self._now = self._sent_at = now
         # After a stall a command may not change by all that the time of the stall would allow.
         counted = min(seconds, 2.0 * self._usual_tick)
-        self._usual_tick = max(self.dt, 0.9 * self._usual_tick + 0.1 * counted)
+        self._usual_tick += 0.1 * (counted - self._usual_tick)
         command = self._guard.command(actions, counted, reason=reason)
         if self._guard.is_safe_action:
             # Whatever comes next is decided anew, on from here.

@@ -150,8 +150,8 @@ class FixedRateSAC(SAC):
     def _clock_of(self, env: VecEnv) -> tuple[OptionSpace, float | None]:
         if not env.has_attr("option_space"):
             raise ValueError(
-                "the environment must be wrapped as sac_at_rate wraps it: load the model without env and call set_env(env), "
-                "which wraps one that is bare"
+                "the environment must be wrapped as sac_at_rate wraps it: call set_env with one bare environment, or make a "
+                "VecEnv with wrapper_class=RewardRateWrapper; a new model is made by sac_at_rate"
             )
         (space, *_), scale = env.get_attr("option_space"), None
         if env.has_attr("reward_scale"):
@@ -179,9 +179,11 @@ class FixedRateSAC(SAC):
         self._updates_due += self.updates_per_step * (self.num_timesteps - max(self._n_seen, self.learning_starts))
         self._n_seen = self.num_timesteps
         assert self.replay_buffer is not None
-        if self._updates_due >= 1 and self.replay_buffer.size():
-            super().train(int(self._updates_due), batch_size)
-            self._updates_due %= 1
+        n_updates = int(self._updates_due)
+        self._updates_due -= n_updates
+        # While all that is played is somebody else's, there is nothing to learn from.
+        if n_updates and self.replay_buffer.size():
+            super().train(n_updates, batch_size)
 
 
 class _PricedReplayBuffer(OptionReplayBuffer):

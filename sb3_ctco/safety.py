@@ -84,7 +84,8 @@ class Guard:
     def restart(self, rows: Any, actions: np.ndarray) -> None:
         """Begin anew for some of several machines: these actions are being sent to them, at rest."""
         if self._sent is not None:
-            self._sent[rows], self._rate[rows] = actions, 0.0
+            self._sent[rows] = np.where(np.isfinite(actions), actions, self._sent[rows])
+            self._rate[rows] = 0.0
 
     def command(self, action: np.ndarray, seconds: float, age: float = 0.0, reason: str | None = None) -> np.ndarray:
         """What is to be sent.

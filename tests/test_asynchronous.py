@@ -259,6 +259,11 @@ def test_a_sac_of_a_fixed_rate_has_its_rewards_weighed(tmp_path):
     trainer = AsynchronousTrainer(model, Point(), tmp_path, real_time=False)
     assert trainer.model.get_env().get_attr("reward_scale") == [model.reward_scale]
     assert model.get_env().get_attr("option_space") == [model.option_space]
+    # A journal tells what its rewards mean.
+    JournalWriter(tmp_path / "journal", trainer_module._meaning(model)).close()
+    other = sac_at_rate(Point(), 0.02, gamma_dt=0.02, **SMALL)
+    with pytest.raises(ValueError, match=r"means something else: options=.*'reward_scale': "):
+        AsynchronousTrainer(other, Point(), tmp_path, resume=True, real_time=False)
     held = sac_at_rate(Point(), 0.02, hold_seconds=0.1, **SMALL)
     with pytest.raises(ValueError, match="has no use for a SAC that holds its actions"):
         AsynchronousTrainer(held, Point(), tmp_path / "held", real_time=False)
@@ -417,8 +422,10 @@ def test_failing_learner_is_reported_with_its_traceback(tmp_path):
     assert (tmp_path / "model.zip").exists()
 
 
-@pytest.mark.parametrize("signum", [signal.SIGINT, signal.SIGTERM])
-def test_ctrl_c_stops_both_within_a_second_and_saves(tmp_path, signum):
+@pytest.mark.parametrize(
+    ("signum", "to_group"), [(signal.SIGINT, True), (signal.SIGTERM, False), (signal.SIGTERM, True)], ids=str
+)
+def test_ctrl_c_stops_both_within_a_second_and_saves(tmp_path, signum, to_group):
     script = tmp_path / "script.py"
     script.write_text(
         textwrap.dedent(
@@ -449,9 +456,9 @@ def test_ctrl_c_stops_both_within_a_second_and_saves(tmp_path, signum):
     for _ in range(100):
         word, learner = process.stdout.readline().split()
         assert word == "acting"
-    # As a terminal does: to every process of the group.
+    # As a terminal, or what ends a service, does: to every process of the group.
     sent = time.monotonic()
-    if signum == signal.SIGINT:
+    if to_group:
         os.killpg(process.pid, signum)
     else:
         process.send_signal(signum)
@@ -1083,13 +1090,17 @@ def test_a_reset_that_is_interrupted_leaves_the_machine_safe(tmp_path):
             raise NotImplementedError
 
     stopped, env = [], Arm()
-    trainer = AsynchronousTrainer(make_model(CTCO, env, buffer_size=100), env, tmp_path, safe_stop=stopped.append)
+    trainer = AsynchronousTrainer(make_model(CTCO, env, buffer_size=100), env, tmp_path / "one", safe_stop=stopped.append)
     with pytest.raises(KeyboardInterrupt):
         trainer.learn(10)
     assert stopped == [env]
+    # What a reset failed by is what is raised, also if it cannot be stopped: send raises NotImplementedError here.
+    trainer = AsynchronousTrainer(make_model(CTCO, env, buffer_size=100), env, tmp_path / "two")
+    with pytest.raises(KeyboardInterrupt):
+        trainer.learn(10)
 
 
-def test_one_trainer_at_a_time_uses_a_folder(collected):
+def test_one_trainer_at_a_time_uses_a_folder(collected, monkeypatch):
     folder, steps = collected
     env = Point()
     trainer = AsynchronousTrainer(make_model(CTCO, env), env, folder, resume=True, real_time=False)
@@ -1098,19 +1109,27 @@ def test_one_trainer_at_a_time_uses_a_folder(collected):
             trainer.learn(steps + 20)
         with pytest.raises(RuntimeError, match="another AsynchronousTrainer uses"):
             AsynchronousTrainer(make_model(CTCO, env), env, folder, resume=True, real_time=False)
+        with pytest.raises(RuntimeError, match="another AsynchronousTrainer uses"):
+            trainer.add_trajectory(np.zeros((31, 2), np.float32), np.zeros((30, 1)), np.zeros(30), True, False, 0.02)
+    # The learner of one that was killed
+    monkeypatch.setattr(trainer_module, "_STOP_SECONDS", 0.2)
+    with lock(folder, name="learner.lock"), pytest.raises(RuntimeError, match="another AsynchronousTrainer uses"):
+        trainer.learn(steps + 20)
 
 
 def test_learning_goes_on_from_all_that_was_learned_when_it_was_interrupted(tmp_path):
+    env = Point()
+    model = make_model(CTCO, env, buffer_size=500)
+    first = model.actor.omega_head.weight.detach().clone()
+
     def interrupt(locals_, globals_):
-        if locals_["self"].num_timesteps > 150:
+        if not th.equal(model.actor.omega_head.weight, first):  # however long the learner takes on a machine that is busy
             raise KeyboardInterrupt
         return True
 
-    env = Point()
-    model = make_model(CTCO, env, buffer_size=500)
     with AsynchronousTrainer(model, env, tmp_path, real_time=False, updates_per_second=500) as trainer:
         with pytest.raises(KeyboardInterrupt):
-            trainer.learn(1000, interrupt)
+            trainer.learn(100_000, interrupt)
         learned = CTCO.load(tmp_path / "model.zip")
         assert learned._n_updates > 0
         trainer.learn(model.num_timesteps + 10)

@@ -338,9 +338,19 @@ def test_a_bare_environment_is_wrapped_as_the_models_was(scripted_env, tmp_path,
 
 
 def test_a_held_sac_whose_warm_up_somebody_else_played(random_walk_env):
-    env = TakeOverWrapper(random_walk_env(), lambda obs: np.zeros(1, np.float32), lambda trajectory: None)
+    """20 updates a second of the 4 s in which somebody gave control back, after three episodes and a little."""
+    n_seen = []
+
+    def somebody(obs):
+        n_seen.append(obs)
+        return np.zeros(1, np.float32) if len(n_seen) < 70 else None
+
+    env = TakeOverWrapper(random_walk_env(), somebody, lambda trajectory: None)
     model = sac_at_rate(env, 0.1, hold_seconds=0.3, learning_starts_seconds=1.0, **SMALL).learn(60)
     assert model.replay_buffer.size() == 0
+    model.learn(40, reset_num_timesteps=False)
+    assert 0 < model.replay_buffer.size() < 20
+    assert 50 <= model._n_updates <= 80  # of 200 that all of the time would have
 
 
 def test_the_quick_policy_knows_one_observation_from_several():

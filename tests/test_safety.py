@@ -437,6 +437,15 @@ def test_limits_need_bounds():
         np.testing.assert_array_equal(guard.command(np.array(action), 0.1), action)
 
 
+def test_some_robots_are_reset_before_their_number_is_known():
+    _, controller = make_controller()
+    assert controller(None, now=0.0).shape == (2,)
+    controller.reset([2])
+    controller.reset(np.array([False, False, True]))
+    with pytest.raises(ValueError, match="before the first tick"):
+        controller.reset([2], last_action=[0.0, 0.0])
+
+
 def test_after_a_stall_a_command_changes_by_two_ticks_worth_at_most():
     policy, controller = make_controller(max_rate=1.0)
     policy.value = 1.0
@@ -444,6 +453,13 @@ def test_after_a_stall_a_command_changes_by_two_ticks_worth_at_most():
         assert controller(np.zeros(3), now=0.1 * k)[0] == 1.0
     policy.value = -1.0
     assert controller(np.zeros(3), now=0.9)[0] == pytest.approx(1.0 - 2 * 0.1 * 2.0)  # at a width, 2, a second
+    # Of ticks that are faster than dt, too
+    policy, controller = make_controller(max_rate=1.0)
+    policy.value = 1.0
+    for k in range(100):
+        assert controller(np.zeros(3), now=0.01 * k)[0] == 1.0
+    policy.value = -1.0
+    assert controller(np.zeros(3), now=1.5)[0] == pytest.approx(1.0 - 2 * 0.01 * 2.0, abs=0.001)
     # A loop that is always slower than dt is no stall.
     policy, controller = make_controller(max_rate=0.1, stale_after=9.0)
     policy.value = 1.0
@@ -471,9 +487,17 @@ def test_one_of_several_robots_begins_from_what_is_sent_to_it():
     controller.reset([2], last_action=[1.0, 4.0])
     np.testing.assert_allclose(controller._guard._sent, [*before[:2], [1.0, 4.0]])
     assert (controller._first[2] == [1.0, 4.0]).all()
-    # And each from its own, from the beginning
+    controller.reset([2])
+    assert (controller._first[2] == controller._middle).all()
+    controller.reset([0], last_action=[np.nan, 2.0])
+    assert np.isfinite(controller._guard._sent).all()
+    # And each from its own, from the beginning, also if the first ticks have nothing to go by
     controller.reset(last_action=[low, HALF, [1.0, 4.0]])
     np.testing.assert_allclose(controller(obs, now=9.0), [[-0.8, 0.4], HALF, [0.8, 3.6]], rtol=1e-6)
+    controller.reset(last_action=[low, low, HALF])
+    for now in (9.1, 9.2):
+        assert controller(None, now=now).shape == (3, 2)
+    assert controller.replaced["no fresh observation"] >= 2
 
 
 def test_what_was_sent_is_asked_in_the_machines_actions_only():

@@ -13,14 +13,15 @@ LOCK = "lock"
 
 
 @contextlib.contextmanager
-def lock(path: Path, patience: float = 0.5) -> Iterator[bool]:
+def lock(path: Path, patience: float = 0.5, name: str = LOCK) -> Iterator[bool]:
     """Hold a folder for this process; the operating system lets go of it when the process dies.
 
     :param path: the folder
     :param patience: how long to try, in s: to ask for a run's state holds its lock for a moment
+    :param name: of the file that is locked
     :return: whether the folder is ours
     """
-    with (path / LOCK).open("a") as file:
+    with (path / name).open("a") as file:
         end = time.monotonic() + patience
         while True:
             try:

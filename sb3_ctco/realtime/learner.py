@@ -19,6 +19,7 @@ import torch as th
 from stable_baselines3.common.logger import Logger
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 
+from sb3_ctco.common.lock import lock
 from sb3_ctco.options import SubOptions
 from sb3_ctco.realtime.journal import Arrays, JournalError, JournalReader
 from sb3_ctco.realtime.weights import SharedWeights
@@ -28,6 +29,8 @@ logger = logging.getLogger(__name__)
 #: How long a round of updates may take, so that it can be stopped in time; in s
 _ROUND_SECONDS = 0.1
 _LOG_SECONDS = 1.0
+#: Held while a learner lives, which may be longer than who started it
+LEARNER_LOCK = "learner.lock"
 
 
 class LearnerError(RuntimeError):
@@ -114,10 +117,10 @@ def run_learner(settings: LearnerSettings, weights: SharedWeights, stop: Any, re
 
     What it reports is ``("ready", None)``, ``("log", {name: value})`` and ``("failed", traceback)``.
     """
-    # Ctrl-C reaches every process of the terminal, and what ends a service its whole group; the acting one decides what to
-    # do about it.
-    for number in (signal.SIGINT, signal.SIGTERM):
-        signal.signal(number, signal.SIG_IGN)
+    # Ctrl-C reaches every process of the terminal; the acting one decides what to do about it. What ends a service reaches its
+    # whole group.
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    signal.signal(signal.SIGTERM, lambda *_: setattr(stop, "value", True))
     os.nice(settings.niceness)
     if settings.n_threads is not None:
         th.set_num_threads(settings.n_threads)
@@ -127,15 +130,16 @@ def run_learner(settings: LearnerSettings, weights: SharedWeights, stop: Any, re
         report.send(("failed", traceback.format_exc()))
         raise SystemExit(1) from None
     exit_code = 0
-    for work in (learner.run, learner.save):
-        try:
-            work()
-        except (BrokenPipeError, ConnectionResetError):
-            pass  # the acting process is gone
-        except Exception:
-            exit_code = 1
-            with contextlib.suppress(BrokenPipeError, ConnectionResetError):
-                report.send(("failed", traceback.format_exc()))
+    with lock(settings.folder, name=LEARNER_LOCK):
+        for work in (learner.run, learner.save):
+            try:
+                work()
+            except (BrokenPipeError, ConnectionResetError):
+                pass  # the acting process is gone
+            except Exception:
+                exit_code = 1
+                with contextlib.suppress(BrokenPipeError, ConnectionResetError):
+                    report.send(("failed", traceback.format_exc()))
     # Everything is on disk. The interpreter would take another second to clear its memory, and the acting process waits.
     sys.stdout.flush()
     sys.stderr.flush()

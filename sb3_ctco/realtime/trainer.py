@@ -40,6 +40,7 @@ from sb3_ctco.fixed_rate import FixedRateSAC
 from sb3_ctco.options import TAKEN_OVER, ValueInterrupt
 from sb3_ctco.realtime.journal import JournalReader, JournalWriter, check_meaning, repair_journal, segments
 from sb3_ctco.realtime.learner import (
+    LEARNER_LOCK,
     LearnerError,
     LearnerSettings,
     Transition,
@@ -134,6 +135,7 @@ class AsynchronousTrainer(Generic[AlgorithmType]):
     :raises TypeError: if ``safe_stop`` or ``interrupt`` is no function
     :raises OSError: if ``folder`` cannot be written to
     :raises FileExistsError: if ``folder`` holds a journal and ``resume`` is not asked for
+    :raises RuntimeError: if ``resume`` is asked for while another trainer uses ``folder``
     """
 
     def __init__(
@@ -225,8 +227,8 @@ class AsynchronousTrainer(Generic[AlgorithmType]):
                 for journal in (self._journal_folder, self._demonstration_folder):
                     repair_journal(journal)
                     check_meaning(journal, _meaning(model))
-            self._load_checkpoint()
-            self._count_timesteps()
+                self._load_checkpoint()
+                self._count_timesteps()
 
     def __enter__(self) -> "AsynchronousTrainer[AlgorithmType]":
         return self
@@ -287,13 +289,13 @@ class AsynchronousTrainer(Generic[AlgorithmType]):
         model.save(start)
         settings = LearnerSettings(type(model), start, self.folder, total_timesteps, **self._settings)
         process = context.Process(target=run_learner, args=(settings, weights, stop, learner_end), name="learner", daemon=True)
-        process.start()
-        learner_end.close()
         link = _Link(process, report, weights, model)
         in_between = _AsynchronousCallback(self, link)
         given = as_callback(callback)
         callbacks = CallbackList([in_between, *([] if given is None else [given])])
         try:
+            process.start()
+            learner_end.close()
             with _sigterm_as_exit():
                 link.wait_until_ready()
                 if self.real_time is not None:
@@ -368,9 +370,10 @@ class AsynchronousTrainer(Generic[AlgorithmType]):
         buffer: Any = self.model.replay_buffer
         added = buffer.add_trajectory(*trajectory)
         buffer.n_demonstrations = 0  # The learner's has them; here they were looked at.
-        self._demonstrations = JournalWriter(self._demonstration_folder, _meaning(self.model))
-        self._keep_demonstration(trajectory)
-        self._demonstrations.close()
+        with _alone_in(self.folder):
+            self._demonstrations = JournalWriter(self._demonstration_folder, _meaning(self.model))
+            self._keep_demonstration(trajectory)
+            self._demonstrations.close()
         return added
 
     def _keep_demonstration(self, trajectory: RecordedTrajectory) -> None:
@@ -403,6 +406,11 @@ class AsynchronousTrainer(Generic[AlgorithmType]):
         try:
             if self._supervisor.has_commanded:
                 self.safe_stop(self.bare_env)
+        except Exception as error:
+            if self._supervisor.has_stepped or error.__context__ is None:
+                raise
+            # Whatever the reset of a machine failed by says more, for instance that it is not connected.
+            logger.exception("safe_stop failed after a reset that did not end")
         finally:
             if self._take_over is not None:
                 self._take_over.hand_over()
@@ -554,6 +562,10 @@ def _alone_in(folder: Path) -> Iterator[None]:
     :raises RuntimeError: if another trainer uses it
     """
     with lock(folder) as alone:
+        if alone:
+            # The learner of one that was killed may still be saving.
+            with lock(folder, _STOP_SECONDS, LEARNER_LOCK) as alone:  # noqa: PLW2901
+                pass
         if not alone:
             raise RuntimeError(f"another AsynchronousTrainer uses {folder}: wait for its end, or pass another folder")
         yield
@@ -565,7 +577,7 @@ class _Supervisor(gym.Wrapper):
     def __init__(self, env: gym.Env):
         super().__init__(env)
         self.check: Callable[[], None] | None = None
-        self.has_commanded = False
+        self.has_commanded = self.has_stepped = False
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
         # A machine moves to where it starts.
@@ -575,7 +587,7 @@ class _Supervisor(gym.Wrapper):
     def step(self, action: Any) -> Any:
         if self.check is not None:
             self.check()
-        self.has_commanded = True
+        self.has_commanded = self.has_stepped = True
         return self.env.step(action)
 
 
@@ -607,6 +619,9 @@ def _meaning(model: OffPolicyAlgorithm) -> dict[str, Any]:
         options = {name: value if isinstance(value, int | float | str) else str(value) for name, value in arguments.items()}
         if model.reward_unit != "rate":
             options["reward_unit"] = model.reward_unit
+    elif isinstance(model, FixedRateSAC) and model.option_space is not None:
+        options = {"dt": model.option_space.dt, "discount_rate": model.option_space.discount_rate}
+        options["reward_scale"] = model.reward_scale
     return {
         "algorithm": type(model).__name__,
         "options": options,
@@ -655,6 +670,8 @@ class _Link:
             )
 
     def join(self) -> None:
+        if self.process.pid is None:
+            return  # was never started
         deadline = time.monotonic() + _STOP_SECONDS
         # The learner does not wait for a reader, but a pipe that is full would not have its last word.
         while self.process.exitcode is None and time.monotonic() < deadline:
