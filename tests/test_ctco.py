@@ -822,6 +822,10 @@ def test_action_noise(random_walk_env):
         ({"gamma_dt": 0.0}, "gamma_dt"),
         ({"entropy_reference": "gaussian"}, "entropy_reference"),
         ({"target_decision_rate": 0.0}, "target_decision_rate must be a positive number of Hz"),
+        (
+            {"target_decision_rate": 2.0, "d_max": 0.5},
+            r"target_decision_rate=2.0 Hz is out of reach .* d_max=0.5 s",
+        ),
         ({"target_decision_rate": 5.0, "high_freq_penalty": 0.0}, "high_freq_penalty=0.0 must be a positive number"),
         ({"target_decision_rate": 5.0, "high_freq_penalty": "relative_0"}, "high_freq_penalty=relative_0 must be a positive"),
         ({"high_freq_penalty": "auto"}, "'relative_<number of at least 0>', such as 'relative_0.1', not 'auto'"),

@@ -90,6 +90,17 @@ def test_accounting_equals_what_was_recorded(dt, unit, terminated, truncated):
     assert added > 150
 
 
+def test_until_the_policy_is_paid_the_price_is_relative_to_what_demonstrations_paid():
+    buffer = make_buffer()
+    observations, actions, _ = recording(60)
+    assert buffer.mean_reward_rate == 1.0
+    buffer.add_trajectory(observations, actions, np.zeros(60), False, False, 0.1)
+    assert buffer.mean_reward_rate == 1.0  # these paid nothing
+    buffer.add_trajectory(observations, actions, np.full(60, -0.001), False, False, 0.1)
+    # R of options of 0.1 to 0.5 s is a little less than what is paid, by their discount.
+    assert buffer.mean_reward_rate == pytest.approx(0.001, rel=0.2)
+
+
 def test_one_weight_plays_a_constant_action_exactly():
     buffer = make_buffer(n_rbf=1)
     observations, _, rewards = recording(20)

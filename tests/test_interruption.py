@@ -131,6 +131,14 @@ def test_the_wrapper_asks_every_period_about_the_rest(scripted_env):
     assert interrupt.asked[-1][0][0, 0] == 9
 
 
+def test_what_is_shorter_than_any_option_stays_the_beginning_of_the_one_that_was_asked_for(scripted_env):
+    env = RealTimeOptionWrapper(scripted_env(), interrupt=lambda *_: True, **SETTINGS, n_sub_options=0, d_min=0.35)
+    env.reset()
+    _, _, _, _, info = env.step([0.5, 1.0])
+    assert info["option"]["n_steps"] == 1
+    assert PLAYED not in info
+
+
 @pytest.mark.parametrize("join", JOINS)
 def test_what_ran_of_an_option_is_one_that_plays_the_same(scripted_env, join):
     """By a rule about observations as well; with Bézier curves exactly."""

@@ -435,6 +435,16 @@ def test_sub_options_leave_from_the_action_before_them(random_walk_env, trajecto
     assert np.mean(residuals) < (0.01 if trajectory == "bezier" else 0.02)
 
 
+def test_an_entry_of_one_value_refuses_no_sub_option(scripted_env):
+    env = scripted_env()
+    env.action_space = spaces.Box(np.array([-1.0, 2.0], np.float32), np.array([1.0, 2.0], np.float32))
+    wrapper = OptionExecutionWrapper(env, n_rbf=3, d_min=0.3, d_max=3.0, join="continuous", n_sub_options=20)
+    wrapper.reset()
+    *_, info = wrapper.step(np.ones(7))
+    assert len(info["sub_options"]) > 5
+    assert info["sub_options"].residuals.max() < 1e-5
+
+
 def test_time_that_a_free_join_does_not_spend(random_walk_env):
     """Nothing is normalised where nobody needs it."""
     env = OptionExecutionWrapper(random_walk_env())

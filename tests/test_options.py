@@ -17,6 +17,7 @@ from sb3_ctco.options import (
     discount,
     discount_rate_from_gamma,
     integrated_reward,
+    shortest_steps,
     step_weight,
     steps_in,
 )
@@ -144,6 +145,11 @@ def test_options_in_a_row_add_up_to_the_whole(rewards, cut):
 
 
 # --- settings
+
+
+def test_the_shortest_option_is_a_step():
+    assert shortest_steps(OptionSpace.make(1, 1.0, 1e-9, 0.02, 0.4)) == 1
+    assert shortest_steps(OptionSpace.make(1, 1.0, 0.05, 0.02, 0.4)) == 3
 
 
 @pytest.mark.parametrize(

@@ -694,10 +694,15 @@ def test_sac_stands_for_a_repeat_of_one_step_and_the_best_is_a_line():
     assert scores.lines_of(records) == [("sac", "large"), ("sac_repeat", "20ms"), ("sac_repeat", "best")]
     lines = scores.by_line(records, "cheetah", "discounted_return")
     sac = lines["sac", "large"]
-    assert lines["sac_repeat", "best"] == {50: [2.0, 2.0], 100: sac[100], 250: [0.1, 0.1], 500: [2.0, 2.0]}
+    # 20 ms at 100 and 250 Hz are two steps and five.
+    assert lines["sac_repeat", "best"] == {50: [2.0, 2.0], 100: [0.3, 0.3], 250: [0.3, 0.3], 500: [2.0, 2.0]}
     # 20 ms at 50 Hz is a step.
     assert lines["sac_repeat", "20ms"] == {50: sac[50], 100: [0.3, 0.3], 250: [0.3, 0.3], 500: [0.3, 0.3]}
     assert scores.with_equal_repeats(synthetic()) == synthetic()
+    # Where no number of steps was tried, none is the best; and a setting of a name of its own is no number of them.
+    held = [{**record, "setting": "slow"} if record["setting"] == "20ms" else record for record in with_repeats()]
+    held = [record for record in held if not record["setting"].endswith("steps")]
+    assert scores.lines_of(scores.with_equal_repeats(held)) == [("sac", "large"), ("sac_repeat", "slow")]
 
 
 def scored(**returns):

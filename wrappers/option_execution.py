@@ -293,6 +293,8 @@ class OptionExecutionWrapper(gym.Wrapper, RecordConstructorArgs):
             self._last_obs = rows_of(seen, -1)
             if before is not None:
                 before = befores[[*steps[:-1], -1]]
+                # Where there is nothing to say, what was sent before says 0.
+                trajectory = np.where(self._box.is_fixed, 0.0, trajectory)
                 seen = with_last_action(self.observation_space, seen, before)
             played, ended = (trajectory, rewards, stretches, steps, seen), (terminated, truncated)
             info["sub_options"] = sub_options(space, *played, *ended, self.reward_unit, self.sub_option_tolerance, before)

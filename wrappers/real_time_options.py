@@ -158,8 +158,9 @@ class RealTimeOptionWrapper(OptionExecutionWrapper):
         if self._is_lost:
             info[TAKEN_OVER] = True
         elif info.get(INTERRUPTED, False) and not self._ahead_steps:
+            # What is shorter than any option is played by none: it stays the beginning of the one that was asked for.
             option, residual = self.option_space.closest(self._box.normalise(self.played), before)
-            if residual <= self.sub_option_tolerance:
+            if residual <= self.sub_option_tolerance and len(self.played) >= shortest_steps(self.option_space):
                 info[PLAYED] = option
         return result
 

@@ -278,11 +278,16 @@ class _OptionStorage(ReplayBuffer):
 
     @property
     def mean_reward_rate(self) -> float:
-        """Mean abs(R) by mean duration, of the last decisions that paid anything, in the unit of rewards; 1 before any.
+        """Mean abs(R) by mean duration, of the last decisions that paid anything, in the unit of rewards.
 
-        What was paid fades over 100 horizons 1/τ of such decisions, 250 s with the paper's discount.
+        What was paid fades over 100 horizons 1/τ of such decisions, 250 s with the paper's discount. Before any, it is that of
+        the demonstrations that paid anything, and 1 without.
         """
-        return self._paid / self._paid_seconds if self._paid_seconds else 1.0
+        if self._paid_seconds:
+            return self._paid / self._paid_seconds
+        rows = slice(self.buffer_size - self.n_demonstrations, None)
+        paid, seconds = np.abs(self.integrated_rewards[rows]), self.durations[rows]
+        return float(paid.sum() / seconds[paid > 0].sum()) if paid.any() else 1.0
 
     def _count_paid(self, integrated_rewards: np.ndarray, durations: np.ndarray) -> None:
         seconds = float(np.sum(durations[integrated_rewards != 0]))

@@ -272,6 +272,11 @@ class CTCO(SoftOptionActorCritic):
             )
         super()._setup_model()
         space, n = self.option_space, self._n_temperatures()
+        if target is not None and target * space.d_max <= 1.0:
+            raise ValueError(
+                f"target_decision_rate={target} Hz is out of reach of options that take d_max={space.d_max} s at most, "
+                f"{1.0 / space.d_max:g} a second at least: pass a larger d_max"
+            )
         # Which temperature each entry of an option has: weights by where they stand in an action's trajectory, and d's own.
         self._parts = th.zeros(self.actor.omega_dim + 1, n + 1, device=self.device)
         self._parts[:-1, :n] = th.eye(n, device=self.device).repeat(self.actor.omega_dim // n, 1)

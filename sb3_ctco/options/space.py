@@ -239,6 +239,8 @@ class ActionBox:
         self.low, self.high = low, high
         self._bottom = low.astype(np.float64).ravel()
         self._half_width = 0.5 * (high.astype(np.float64).ravel() - self._bottom)
+        #: Which entries of an action have one value only, ``[action_dim]``
+        self.is_fixed = self._half_width == 0.0
 
     def actions(self, trajectory: FloatArray) -> npt.NDArray[Any]:
         """Normalised actions in the units of the box.
@@ -261,7 +263,7 @@ class ActionBox:
         if given.ndim == 0 or given.shape[1:] != self.low.shape:
             raise ValueError(f"actions must have shape [n, *{self.low.shape}], not {given.shape}")
         # Where both bounds are the same, there is nothing to say, which is 0.
-        width = np.where(self._half_width > 0, self._half_width, 1.0)
+        width = np.where(self.is_fixed, 1.0, self._half_width)
         return (given.reshape(len(given), self._bottom.size) - self._bottom - self._half_width) / width
 
     def cast(self, actions: FloatArray) -> npt.NDArray[Any]:

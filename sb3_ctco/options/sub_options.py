@@ -29,8 +29,8 @@ def rows_of(stacked: Stacked, rows: Any) -> Any:
 
 
 def shortest_steps(space: OptionSpace) -> int:
-    """The fewest steps that are as long as the shortest duration."""
-    return math.ceil(space.d_min / space.dt - 1e-6)
+    """The fewest steps that are as long as the shortest duration, at least one."""
+    return max(1, math.ceil(space.d_min / space.dt - 1e-6))
 
 
 def draw_stretches(rng: np.random.Generator, n: int, n_steps: int, shortest: int) -> list[tuple[int, int]]:

@@ -3,6 +3,7 @@
 import contextlib
 import itertools
 import math
+import re
 from collections import Counter, defaultdict
 from collections.abc import Callable, Iterator, Sequence
 
@@ -85,8 +86,8 @@ def with_equal_repeats(records: Sequence[Record]) -> list[Record]:
     """Records in which SAC stands for an action repeat wherever it is one, and the best repeat is a line of its own.
 
     An action that is held for one step, or for 20 ms at 50 Hz, is SAC itself. Of the settings of ``sac_repeat`` in steps, that
-    with the best mean return in training is kept for each task and rate, as setting ``best``: it is chosen by what it is
-    judged by, which favours it.
+    with the best mean return in training is kept for each task and rate that has any, as setting ``best``: it is chosen by
+    what it is judged by, which favours it. What is held for a time that is whole steps competes with them.
     """
     repeats = [record for record in records if record["algorithm"] == "sac_repeat"]
     if not repeats:
@@ -96,12 +97,22 @@ def with_equal_repeats(records: Sequence[Record]) -> list[Record]:
     kept = [record for record in records if record["algorithm"] != "sac_repeat" or record["setting"] in held]
     kept += [{**record, "setting": name} for record in sac if (name := f"{1000 * record['dt']:g}ms") in held]
     cells: dict[tuple[str, int], dict[str, list[Record]]] = defaultdict(lambda: defaultdict(list))
-    for record in [*sac, *(record for record in repeats if record["setting"] not in held)]:
-        cells[record["task"], rate_of(record)][record["setting"]].append(record)
+    for record in [*sac, *repeats]:
+        if record["setting"] not in held or _is_whole_steps(record):
+            cells[record["task"], rate_of(record)][record["setting"]].append(record)
     for of_setting in cells.values():
+        if not any(setting.endswith(STEPS) for setting in of_setting):
+            continue
         best = max(of_setting.values(), key=lambda group: float(np.mean([one["discounted_return"] for one in group])))
         kept += [{**record, "setting": BEST} for record in best]
     return kept
+
+
+def _is_whole_steps(record: Record) -> bool:
+    """Whether a setting such as 20ms is an action repeat of some steps, and not of a part of one."""
+    named = re.fullmatch(r"([\d.]+)ms", record["setting"])
+    steps = float(named[1]) / 1000.0 / record["dt"] if named else 0.5
+    return abs(steps - round(steps)) < 1e-6
 
 
 def complete_seeds(records: Sequence[Record], metric: str, tasks: Sequence[str]) -> dict[Line, dict[int, np.ndarray]]:
