@@ -131,9 +131,7 @@ class FixedRateSAC(SAC):
             return hold_actions(
                 env, space.d_max, space.arguments["n_rbf"], space.d_min < space.d_max, space.dt, space.discount_rate
             )
-        if unwrap_wrapper(env, Monitor) is None:
-            env = Monitor(env)
-        return RewardRateWrapper(env, space.dt, space.discount_rate, self.reward_scale or 1.0)
+        return _with_reward_rate(env, space.dt, space.discount_rate, self.reward_scale or 1.0)  # type: ignore[return-value]
 
     def set_env(self, env: GymEnv, force_reset: bool = True) -> None:
         """Stable-Baselines3's ``set_env``; a bare environment is wrapped as the model's own.

@@ -423,8 +423,9 @@ class OptionOffPolicyAlgorithm(OffPolicyAlgorithm):
             space = self._check_env(self.env)
             self.dt, self.d_min = space.dt, space.d_min
         super()._setup_model()
-        self._tell_buffer()
-        if self.env is not None:
+        if self.env is None:
+            self._tell_buffer()
+        else:
             self._adopt_env(self.env)
         self._warn_of_a_large_buffer()
 

@@ -387,8 +387,6 @@ class CTCO(SoftOptionActorCritic):
         :param gradient_steps: number of updates
         :param batch_size: decisions in a minibatch
         """
-        if not self.replay_buffer.size():  # type: ignore[union-attr]
-            return
         if self.target_decision_rate is not None:
             self._update_high_freq_penalty()
         self._penalty_unit = self._paid_in_the_shortest_option()

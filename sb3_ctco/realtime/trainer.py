@@ -58,6 +58,7 @@ from sb3_ctco.wrappers import (
     TakeOver,
     TakeOverWrapper,
 )
+from sb3_ctco.wrappers.checks import reset_env
 
 logger = logging.getLogger(__name__)
 
@@ -561,12 +562,13 @@ def _alone_in(folder: Path) -> Iterator[None]:
 
     :raises RuntimeError: if another trainer uses it
     """
-    with lock(folder) as alone:
-        if alone:
+    with lock(folder) as acts_alone:
+        learns_alone = False
+        if acts_alone:
             # The learner of one that was killed may still be saving.
-            with lock(folder, _STOP_SECONDS, LEARNER_LOCK) as alone:  # noqa: PLW2901
+            with lock(folder, _STOP_SECONDS, LEARNER_LOCK) as learns_alone:
                 pass
-        if not alone:
+        if not learns_alone:
             raise RuntimeError(f"another AsynchronousTrainer uses {folder}: wait for its end, or pass another folder")
         yield
 
@@ -582,7 +584,7 @@ class _Supervisor(gym.Wrapper):
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
         # A machine moves to where it starts.
         self.has_commanded = self.has_commanded or isinstance(self.env.unwrapped, SupportsSendReceive)
-        return self.env.reset(seed=seed, options=options) if options is not None else self.env.reset(seed=seed)
+        return reset_env(self.env, seed, options)
 
     def step(self, action: Any) -> Any:
         if self.check is not None:
