@@ -386,6 +386,30 @@ def test_with_one_step_options_targets_and_losses_are_sacs():
         th.testing.assert_close(found[:, :1], one, rtol=1e-6, atol=1e-6)
 
 
+@pytest.mark.parametrize("target_actor", [True, False])
+def test_targets_sample_the_target_actor_or_as_sac_s_the_actor(tmp_path, random_walk_env, target_actor):
+    model = make(random_walk_env(), policy_kwargs={"net_arch": [8], "target_actor": target_actor}).learn(100)
+    model.save(tmp_path / "model")
+    model.policy.save(tmp_path / "policy.pt")
+    loaded = CTCO.load(tmp_path / "model")
+    data = model.replay_buffer.sample(32)
+    for one in (model, loaded):
+        assert (one.actor_target is one.actor) == (one.policy.actor_target is one.policy.actor) == (not target_actor)
+        with th.no_grad():
+            one.actor.omega_head.bias.add_(1.0)  # which a target does not follow before the next update
+            th.manual_seed(0)
+            targets = one._critic_targets(data)
+            actor = one.policy.actor_target if target_actor else one.policy.actor
+            th.manual_seed(0)
+            options, log_prob = actor.option_log_prob(data.next_observations)
+            q_values = one.critic_target(data.next_observations, one._as_critics_see(options))
+            expected = one._targets(data, q_values, one.entropy_costs(log_prob @ one._parts))
+        th.testing.assert_close(targets, expected, rtol=0, atol=0)
+    policy = CTCOPolicy.load(tmp_path / "policy.pt")
+    assert (policy.actor_target is policy.actor) == (not target_actor)
+    assert all(p.requires_grad for p in policy.actor.parameters())
+
+
 @th.no_grad()
 def copy_weights(sac, model):
     """SAC's networks of one hidden layer as CTCO's; a fixed duration has no part in values."""

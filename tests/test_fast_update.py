@@ -41,6 +41,7 @@ def plain(model):
         {"entropy_reference": "paper", "duration_scale": "linear"},
         {"entropy_reference": "average", "ent_coef": 0.5},
         {"policy_kwargs": {"n_critics": 1, "net_arch": [8]}},
+        {"policy_kwargs": {"target_actor": False, "net_arch": [8]}},
         {"policy_kwargs": {"n_critics": 3, "net_arch": {"pi": [8, 8, 8], "qf": []}}},
         {"policy_kwargs": {"net_arch": [8], "optimizer_kwargs": {"betas": (0.8, 0.9), "eps": 1e-5, "weight_decay": 0.1}}},
         {"d_min": 0.1, "d_max": 0.1},

@@ -319,7 +319,8 @@ class CTCO(SoftOptionActorCritic):
         self._penalty_unit = learned._penalty_unit
 
     def _networks_and_targets(self) -> list[tuple[nn.Module, nn.Module]]:
-        return [*super()._networks_and_targets(), (self.actor, self.actor_target)]
+        actors = [(self.actor, self.actor_target)] if self.policy.target_actor else []
+        return [*super()._networks_and_targets(), *actors]
 
     def _create_aliases(self) -> None:
         super()._create_aliases()

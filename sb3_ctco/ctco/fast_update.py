@@ -136,7 +136,7 @@ class FastUpdate:
         self._actor_adam.step()
 
         self._critics.update_targets(model.tau)
-        self._actors.networks.update_targets(model.tau)
+        self._actors.networks.update_targets(model.tau if model.policy.target_actor else 1.0)
         return th.stack((pi_loss, q_loss, ent_coef_loss))
 
     def _features(self, obs: th.Tensor) -> th.Tensor:

@@ -73,7 +73,11 @@ class OptionCritic(EnsembleCritic):
 
 
 class CTCOPolicy(SoftOptionPolicy):
-    """Actor, critics and targets of CTCO; see :class:`~sb3_ctco.common.policies.SoftOptionPolicy`."""
+    """Actor, critics and targets of CTCO; see :class:`~sb3_ctco.common.policies.SoftOptionPolicy`.
+
+    :param target_actor: whether critics' targets sample a target of the actor, which follows it slowly, as in the paper's
+        Algorithm 1; without one they sample the actor itself, as SAC's do
+    """
 
     actor_class = OptionActor
     critic_class = OptionCritic
@@ -82,13 +86,25 @@ class CTCOPolicy(SoftOptionPolicy):
     critic: OptionCritic  # type: ignore[assignment]
     critic_target: OptionCritic  # type: ignore[assignment]
 
+    def __init__(self, *args: Any, target_actor: bool = True, **kwargs: Any):
+        self.target_actor = target_actor
+        super().__init__(*args, **kwargs)
+
     def _build(self, lr_schedule: Schedule) -> None:
         super()._build(lr_schedule)
         self.actor.optimizer.register_load_state_dict_pre_hook(_in_one_group)
+        if not self.target_actor:
+            self.actor_target = self.actor
+            return
         self.actor_target = self.make_actor()
         self.actor_target.load_state_dict(self.actor.state_dict())
         self.actor_target.requires_grad_(False)
         self.actor_target.set_training_mode(False)
+
+    def _get_constructor_parameters(self) -> dict[str, Any]:
+        data = super()._get_constructor_parameters()
+        data.update(target_actor=self.target_actor)
+        return data
 
 
 def _in_one_group(_: th.optim.Optimizer, state: dict[str, Any]) -> dict[str, Any]:
