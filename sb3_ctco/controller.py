@@ -22,6 +22,7 @@ from sb3_ctco.options import (
     ActionBox,
     OptionSpace,
     ValueInterrupt,
+    check_seconds,
     shortest_steps,
     stack,
     steps_in,
@@ -176,8 +177,7 @@ class OptionController:
         interrupt: ValueInterrupt | None = None,
         safety: Safety | None = Safety(),  # noqa: B008 (frozen)
     ):
-        if not (replan_period is None or 0 < replan_period < math.inf):
-            raise ValueError(f"replan_period must be a positive number of seconds or None, not {replan_period}")
+        check_seconds(replan_period=replan_period)
         if not (interrupt is None or isinstance(interrupt, ValueInterrupt)):
             raise TypeError(
                 f"interrupt must be a ValueInterrupt such as CriticInterrupt(model, check_period=0.05), not {interrupt!r}: "

@@ -21,7 +21,7 @@ from torch import nn
 
 from sb3_ctco.common.buffers import OptionReplayBuffer
 from sb3_ctco.common.callbacks import as_callback, in_primitive_steps
-from sb3_ctco.options import OptionSpace, discount, discount_rate_from_gamma, step_weight
+from sb3_ctco.options import OptionSpace, check_seconds, discount, discount_rate_from_gamma, step_weight
 from sb3_ctco.wrappers import OptionExecutionWrapper, RewardRateWrapper
 
 
@@ -128,9 +128,9 @@ class FixedRateSAC(SAC):
         space = self.option_space
         assert space is not None  # since there was an environment
         if self.updates_per_step is not None:
-            return hold_actions(
-                env, space.d_max, space.arguments["n_rbf"], space.d_min < space.d_max, space.dt, space.discount_rate
-            )
+            n_rbf, (action_dim,) = space.arguments["n_rbf"], self.action_space.shape  # type: ignore[misc]
+            learned_duration = action_dim > n_rbf * int(np.prod(env.action_space.shape))  # type: ignore[arg-type]
+            return hold_actions(env, space.d_max, n_rbf, learned_duration, space.dt, space.discount_rate)
         return _with_reward_rate(env, space.dt, space.discount_rate, self.reward_scale or 1.0)  # type: ignore[return-value]
 
     def set_env(self, env: GymEnv, force_reset: bool = True) -> None:
@@ -274,8 +274,7 @@ def sac_at_rate(
                 "learning_starts_seconds in its place"
             )
     discount_rate = discount_rate_from_gamma(gamma, gamma_dt)
-    if not (dt > 0 and np.isfinite(dt)):
-        raise ValueError(f"dt must be a positive number of seconds, not {dt}")
+    check_seconds(dt=dt)
     if not (updates_per_second > 0 and np.isfinite(updates_per_second)):
         raise ValueError(f"updates_per_second must be positive, not {updates_per_second}")
     if not (learning_starts_seconds >= 0 and np.isfinite(learning_starts_seconds)):

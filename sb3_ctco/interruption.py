@@ -7,6 +7,7 @@ import numpy as np
 import torch as th
 
 from sb3_ctco.ctco import CTCO
+from sb3_ctco.options import check_seconds
 
 if TYPE_CHECKING:
     from stable_baselines3.common.vec_env import VecNormalize
@@ -35,8 +36,7 @@ class CriticInterrupt:
     def __init__(self, model: CTCO, check_period: float, margin: float = 0.0, vec_normalize: "VecNormalize | None" = None):
         if not isinstance(model, CTCO):
             raise TypeError(f"the critics that end an option are CTCO's, not {type(model).__name__}'s")
-        if not (check_period > 0 and math.isfinite(check_period)):
-            raise ValueError(f"check_period must be a positive number of seconds, not {check_period}")
+        check_seconds(check_period=check_period)
         if not math.isfinite(margin):
             raise ValueError(f"margin must be a finite number, in the unit of the critics' values, not {margin}")
         self.model = model

@@ -20,9 +20,9 @@ from sb3_ctco.common.option_algorithm import OptionOffPolicyAlgorithm
 from sb3_ctco.ctco import CTCO
 from sb3_ctco.dac_ppo import DACPPO
 from sb3_ctco.figar_sac import FiGARSAC
-from sb3_ctco.fixed_rate import FixedDurationWrapper, QuickSACPolicy, hold_actions, sac_at_rate
+from sb3_ctco.fixed_rate import FixedRateSAC, QuickSACPolicy, sac_at_rate
 from sb3_ctco.options import OptionSpace, discount_rate_from_gamma
-from sb3_ctco.wrappers import OptionExecutionWrapper, RewardRateWrapper, find_dt
+from sb3_ctco.wrappers import RewardRateWrapper, find_dt
 
 
 @dataclass(frozen=True)
@@ -103,7 +103,7 @@ class Algorithm:
 
     ``make(make_env, dt, arguments)`` returns a model. ``make_env()`` is the bare environment, ``dt`` its interaction period
     in s, ``arguments`` are a preset's, of which those in seconds have become steps.
-    ``make_eval_env(model, make_env, dt, discount_rate)`` returns an environment to evaluate it in.
+    ``make_eval_env(model, make_env)`` returns an environment to evaluate it in.
 
     :param name: in presets, records and RL Zoo
     :param label: in figures and tables
@@ -118,7 +118,7 @@ class Algorithm:
     colour: str
     constructors: tuple[Callable[..., Any], ...]
     make: Callable[[Callable[[], gym.Env], float, dict[str, Any]], BaseAlgorithm]
-    make_eval_env: Callable[[Any, Callable[[], gym.Env], float, float], VecEnv]
+    make_eval_env: Callable[[Any, Callable[[], gym.Env]], VecEnv]
     in_steps: Callable[[dict[str, Any], float, float], dict[str, Any]]
     zoo_class: type[BaseAlgorithm] | None = None
 
@@ -156,35 +156,25 @@ def _warm_up_in_steps(arguments: dict[str, Any], dt: float, episode_seconds: flo
     return arguments
 
 
+def _wrapped_as_the_model_s(model: OptionOffPolicyAlgorithm | FixedRateSAC, make_env: Callable[[], gym.Env]) -> VecEnv:
+    return DummyVecEnv([lambda: model.wrap_env(make_env())])
+
+
 def _of_options(algorithm: type[OptionOffPolicyAlgorithm]) -> dict[str, Any]:
     """What rows of algorithms that decide by options share."""
     return {
         "constructors": (algorithm,),
         "make": lambda make_env, dt, arguments: algorithm(env=make_env(), **{"policy": "MlpPolicy", **arguments}),
-        "make_eval_env": lambda model, make_env, dt, discount_rate: DummyVecEnv([lambda: model.wrap_env(make_env())]),
+        "make_eval_env": _wrapped_as_the_model_s,
         "in_steps": _warm_up_in_steps,
         "zoo_class": algorithm,
     }
-
-
-def _with_reward_rate(make_env: Callable[[], gym.Env], dt: float, discount_rate: float, n_envs: int = 1) -> VecEnv:
-    return DummyVecEnv([lambda: RewardRateWrapper(Monitor(make_env()), dt=dt, discount_rate=discount_rate)] * n_envs)
 
 
 def _make_sac(make_env: Callable[[], gym.Env], dt: float, arguments: dict[str, Any]) -> SAC:
     other_noise = arguments.get("use_sde") or arguments.get("pink_noise_seconds") is not None
     policy = "MlpPolicy" if other_noise else QuickSACPolicy
     return sac_at_rate(make_env(), dt=dt, **{"policy": policy, **arguments})
-
-
-def _make_sac_eval_env(model: SAC, make_env: Callable[[], gym.Env], dt: float, discount_rate: float) -> VecEnv:
-    env = model.get_env()
-    assert env is not None
-    if not env.env_is_wrapped(OptionExecutionWrapper)[0]:
-        return _with_reward_rate(make_env, dt, discount_rate)
-    options: OptionSpace = env.get_attr("option_space")[0]
-    held = options.d_max, options.trajectory.n_weights, not env.env_is_wrapped(FixedDurationWrapper)[0], dt, discount_rate
-    return DummyVecEnv([lambda: hold_actions(make_env(), *held)])
 
 
 def _action_repeat_in_seconds(arguments: dict[str, Any], dt: float, episode_seconds: float) -> dict[str, Any]:
@@ -198,9 +188,13 @@ def _action_repeat_in_seconds(arguments: dict[str, Any], dt: float, episode_seco
 _SAC: dict[str, Any] = {
     "constructors": (sac_at_rate, SAC),
     "make": _make_sac,
-    "make_eval_env": _make_sac_eval_env,
+    "make_eval_env": _wrapped_as_the_model_s,
     "in_steps": _action_repeat_in_seconds,
 }
+
+
+def _with_reward_rate(make_env: Callable[[], gym.Env], dt: float, discount_rate: float, n_envs: int = 1) -> VecEnv:
+    return DummyVecEnv([lambda: RewardRateWrapper(Monitor(make_env()), dt=dt, discount_rate=discount_rate)] * n_envs)
 
 
 def _make_dac_ppo(make_env: Callable[[], gym.Env], dt: float, arguments: dict[str, Any]) -> DACPPO:
@@ -209,9 +203,12 @@ def _make_dac_ppo(make_env: Callable[[], gym.Env], dt: float, arguments: dict[st
     return DACPPO(env=VecNormalize(env, norm_reward=False), **{"policy": "MlpPolicy", **arguments})
 
 
-def _make_dac_ppo_eval_env(model: DACPPO, make_env: Callable[[], gym.Env], dt: float, discount_rate: float) -> VecEnv:
-    env = VecNormalize(_with_reward_rate(make_env, dt, discount_rate), training=False, norm_reward=False)
-    sync_envs_normalization(model.get_env(), env)  # type: ignore[arg-type]
+def _make_dac_ppo_eval_env(model: DACPPO, make_env: Callable[[], gym.Env]) -> VecEnv:
+    own = model.get_env()
+    assert own is not None
+    clock: OptionSpace = own.get_attr("option_space")[0]
+    env = VecNormalize(_with_reward_rate(make_env, clock.dt, clock.discount_rate), training=False, norm_reward=False)
+    sync_envs_normalization(own, env)
     return env
 
 

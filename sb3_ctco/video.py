@@ -45,7 +45,7 @@ class RecordEpisodes(gym.Wrapper, RecordConstructorArgs):
         gym.Wrapper.__init__(self, env)
         if env.render_mode != "rgb_array":
             raise ValueError(f"a video needs gymnasium.make(..., render_mode='rgb_array'), not {env.render_mode!r}")
-        dt = find_dt(env, required_by=type(self).__name__) if dt is None else dt
+        dt = find_dt(env, required_by=type(self).__name__, given=dt)
         if not fps > 0:
             raise ValueError(f"fps must be positive, not {fps}")
         self.folder, self.name, self.dt, self.progress = Path(folder), name, dt, progress

@@ -18,7 +18,7 @@ from sb3_ctco.exported import OnnxPolicy, to_metadata
 from sb3_ctco.options import OptionSpace, RadialBasis
 
 DT = 0.1
-SETTINGS = OptionSpace.make(n_rbf=1, d_max=0.4, d_min=DT, dt=DT, discount_rate=0.4)
+SETTINGS = OptionSpace.make(n_rbf=1, d_max=0.4, d_min=DT, dt=DT, discount_rate=0.4, duration_scale="linear")
 SPACE = spaces.Box(np.array([-2.0, 0.0], np.float32), np.array([2.0, 10.0], np.float32))
 
 

@@ -31,7 +31,7 @@ def make_buffer(size=10_000, n_rbf=2, d_min=0.1, d_max=0.5, space=STEPS, **kwarg
         spaces.Box(-1.0, 1.0, (2 * n_rbf + 1,), np.float32),
         device="cpu",
         discount_rate=TAU,
-        option_space=OptionSpace.make(n_rbf, d_max, d_min, 0.1, TAU),
+        option_space=OptionSpace.make(n_rbf, d_max, d_min, 0.1, TAU, "rbf", "linear"),
         primitive_action_space=ACTIONS,
         **kwargs,
     )

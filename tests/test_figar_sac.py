@@ -112,7 +112,7 @@ def test_the_critic_learns_the_repetition_that_ran(random_walk_env):
 @pytest.mark.parametrize("n", [*range(1, 25), 79, 100, 127, 300, 517])
 def test_repetitions_are_exact(dt, n):
     """Each k of {1, …, K} becomes k steps, whether numpy or torch encodes it, in single precision."""
-    option = OptionSpace.make(n_rbf=1, d_max=n * dt, d_min=dt, dt=dt, discount_rate=0.0)
+    option = OptionSpace.make(1, n * dt, dt, dt, discount_rate=0.0, duration_scale="linear")
     repetitions = np.arange(1, n + 1, dtype=np.float32)
     for encoded in (encode_repetitions(repetitions, n), encode_repetitions(th.tensor(repetitions), n).numpy()):
         assert encoded.dtype == np.float32
@@ -125,7 +125,7 @@ def test_repetitions_are_exact(dt, n):
 @given(n=st.integers(1, 5000), dt=st.floats(1e-4, 10.0), share=st.floats(0.0, 1.0))
 def test_any_repetition_is_exact(n, dt, share):
     k = 1 + round(share * (n - 1))
-    option = OptionSpace.make(n_rbf=1, d_max=n * dt, d_min=dt, dt=dt, discount_rate=0.0)
+    option = OptionSpace.make(1, n * dt, dt, dt, discount_rate=0.0, duration_scale="linear")
     encoded = encode_repetitions(np.array([k], dtype=np.float32), n)
     assert option.decode(np.array([0.0, encoded[0]], dtype=np.float32))[1] == k
 

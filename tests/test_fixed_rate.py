@@ -265,6 +265,15 @@ def test_a_held_sac_is_saved_and_evaluated(scripted_env, tmp_path):
     assert math.isfinite(episodes[0].mean_absolute_jerk)
 
 
+@pytest.mark.parametrize("learned_duration", [False, True])
+@pytest.mark.parametrize("hold_seconds", [0.1, 0.5])
+def test_an_environment_to_evaluate_in_has_the_model_s_actions(scripted_env, hold_seconds, learned_duration):
+    """Also where decisions take one step, so that a learned duration has nothing to say."""
+    held = {"hold_seconds": hold_seconds, "learned_duration": learned_duration, "n_rbf": 2}
+    model = sac_at_rate(scripted_env(dt=0.1), 0.1, **held, **SMALL)
+    assert model.wrap_env(scripted_env(dt=0.1)).action_space == model.action_space
+
+
 def test_a_learned_duration_and_the_price_of_a_decision(scripted_env):
     """TaCoS: rewards of 1 a second, and each decision costs 0.05, whatever time it takes; updates follow the time."""
     kwargs = {"gamma": 0.9, "gamma_dt": 0.1, "learning_starts_seconds": 2.0, "hold_seconds": 0.5, **SMALL}

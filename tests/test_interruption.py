@@ -103,7 +103,7 @@ def test_bad_arguments(toy, random_walk_env):
     with pytest.raises(TypeError, match=r"to follow a rule of your own, call decide_anew\(\)"):
         OptionController(toy, interrupt=lambda *_: True)
     for period in (0, np.inf):
-        with pytest.raises(ValueError, match=f"replan_period must be a positive number of seconds or None, not {period}"):
+        with pytest.raises(ValueError, match=f"replan_period must be a positive number of seconds, not {period}"):
             OptionController(toy, replan_period=period)
     with pytest.raises(ValueError, match="decided on already with decide_ahead"):
         RealTimeOptionWrapper(random_walk_env(), decide_ahead=0.1, interrupt=Scripted(0.2), **SETTINGS)
@@ -224,7 +224,7 @@ def test_the_controller_ends_what_the_wrapper_ends(scripted_env, join, clock):
 class TwoRobots:
     """Each is given its own number as action, for one second."""
 
-    option_space = OptionSpace.make(1, 1.0, DT, DT, 0.4)
+    option_space = OptionSpace.make(1, 1.0, DT, DT, 0.4, duration_scale="linear")
     primitive_action_space = spaces.Box(-1.0, 1.0, (1,))
 
     def __init__(self):

@@ -17,7 +17,15 @@ from stable_baselines3.common.monitor import Monitor
 from sb3_ctco import CTCO
 from sb3_ctco.fixed_rate import sac_at_rate
 from sb3_ctco.options import RadialBasis
-from sb3_ctco.wrappers import OptionExecutionWrapper, SupportsStepSequence, find_dt
+from sb3_ctco.video import RecordEpisodes
+from sb3_ctco.wrappers import (
+    OptionExecutionWrapper,
+    RealTimeWrapper,
+    RewardRateWrapper,
+    SupportsStepSequence,
+    TakeOverWrapper,
+    find_dt,
+)
 
 TAU = math.log(2.0)  # half in a second
 
@@ -320,6 +328,27 @@ def test_dt_is_found(scripted_env):
 def test_dt_that_is_not_found(scripted_env):
     with pytest.raises(ValueError, match="pass dt"):
         wrap(scripted_env(dt=None))
+
+
+def in_a_film(env, dt):
+    env.render_mode = "rgb_array"
+    return RecordEpisodes(env, "films", dt=dt)
+
+
+@pytest.mark.parametrize(
+    "wrapper",
+    [
+        wrap,
+        in_a_film,
+        RealTimeWrapper,
+        RewardRateWrapper,
+        lambda env, dt: TakeOverWrapper(env, lambda obs: None, lambda trajectory: None, dt=dt),
+    ],
+)
+@pytest.mark.parametrize("dt", [0.0, -0.1, math.inf, math.nan])
+def test_dt_out_of_range(scripted_env, wrapper, dt):
+    with pytest.raises(ValueError, match=f"dt must be a positive number of seconds, not {dt}"):
+        wrapper(scripted_env(), dt=dt)
 
 
 # --- among other wrappers

@@ -161,7 +161,7 @@ def test_durations_are_rounded_half_up_to_at_least_one_step(duration, dt, expect
 
 
 def test_decode():
-    settings = OptionSpace.make(n_rbf=2, d_max=1.0, d_min=0.2, dt=0.1, discount_rate=0.4)
+    settings = OptionSpace.make(n_rbf=2, d_max=1.0, d_min=0.2, dt=0.1, discount_rate=0.4, duration_scale="linear")
     omega, n_steps = settings.decode(np.array([0.1, 0.2, 0.3, 0.4, 0.0]))
     np.testing.assert_array_equal(omega, [[0.1, 0.2], [0.3, 0.4]])
     assert n_steps == 6  # the middle of [0.2, 1.0] s

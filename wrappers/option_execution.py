@@ -30,11 +30,11 @@ from sb3_ctco.options import (
     Trajectory,
     default_durations,
     draw_stretches,
+    fit_sub_options,
     integrated_reward,
     rows_of,
     shortest_steps,
     stack,
-    sub_options,
     with_last_action,
     with_last_action_space,
 )
@@ -164,12 +164,11 @@ class OptionExecutionWrapper(gym.Wrapper, RecordConstructorArgs):
             raise ValueError(f"reward_unit must be one of {REWARD_UNITS}, not {reward_unit!r}")
         if not sub_option_tolerance >= 0:
             raise ValueError(f"sub_option_tolerance must be at least 0, not {sub_option_tolerance}")
-        if dt is None:
-            dt = find_dt(env, required_by="OptionExecutionWrapper")
-        else:
+        if dt is not None:
             with contextlib.suppress(Exception):  # An environment may tell nonsense, which a given dt corrects.
                 told = find_dt(env)
                 self.overrides_dt = told is not None and not math.isclose(told, dt, rel_tol=1e-6)
+        dt = find_dt(env, required_by="OptionExecutionWrapper", given=dt)
         shortest, longest = default_durations(discount_rate)
         d_min = max(shortest, dt) if d_min is None else d_min or dt
         d_max = longest if d_max is None else d_max
@@ -297,7 +296,7 @@ class OptionExecutionWrapper(gym.Wrapper, RecordConstructorArgs):
                 trajectory = np.where(self._box.is_fixed, 0.0, trajectory)
                 seen = with_last_action(self.observation_space, seen, before)
             played, ended = (trajectory, rewards, stretches, steps, seen), (terminated, truncated)
-            info["sub_options"] = sub_options(space, *played, *ended, self.reward_unit, self.sub_option_tolerance, before)
+            info["sub_options"] = fit_sub_options(space, *played, *ended, self.reward_unit, self.sub_option_tolerance, before)
         return obs, float(rewards.sum()) if self.reward == "sum" else integral, terminated, truncated, info
 
     def set_n_sub_options(self, n_sub_options: int) -> None:

@@ -1,7 +1,6 @@
 """Hold an environment to the wall clock."""
 
 import logging
-import math
 import time
 from dataclasses import dataclass
 from typing import Any, Literal, Protocol, SupportsFloat, runtime_checkable
@@ -115,13 +114,11 @@ class RealTimeWrapper(gym.Wrapper, RecordConstructorArgs):
     ):
         RecordConstructorArgs.__init__(self, dt=dt, clock=clock, tolerance=tolerance, safety=safety, _disable_deepcopy=True)
         gym.Wrapper.__init__(self, env)
-        dt = find_dt(env, required_by="RealTimeWrapper") if dt is None else dt
-        if not (dt > 0 and math.isfinite(dt)):
-            raise ValueError(f"dt must be a positive number of seconds, not {dt}")
+        dt = find_dt(env, required_by="RealTimeWrapper", given=dt)
         if not tolerance >= 0:
             raise ValueError(f"tolerance must be a number of seconds that is at least 0, not {tolerance}")
         #: Period, in s
-        self.dt = float(dt)
+        self.dt = dt
         self.tolerance = float(tolerance)
         self.clock: Clock = WallClock() if clock is None else clock
         self.statistics = TickStatistics()

@@ -44,7 +44,7 @@ class RewardRateWrapper(gym.Wrapper, RecordConstructorArgs):
     ):
         RecordConstructorArgs.__init__(self, dt=dt, discount_rate=discount_rate, reward_scale=reward_scale)
         gym.Wrapper.__init__(self, env)
-        dt = find_dt(env, required_by="RewardRateWrapper") if dt is None else dt
+        dt = find_dt(env, required_by="RewardRateWrapper", given=dt)
         #: The clock: a step as an option of one step
         self.option_space = OptionSpace.make(1, d_max=dt, d_min=dt, dt=dt, discount_rate=discount_rate)
         self.reward_scale = reward_scale

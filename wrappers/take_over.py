@@ -38,7 +38,7 @@ class TakeOverWrapper(gym.Wrapper, RecordConstructorArgs):
         RecordConstructorArgs.__init__(self, take_over=take_over, record=record, dt=dt, _disable_deepcopy=True)
         gym.Wrapper.__init__(self, env)
         refuse_other_actions(env, "take_over")
-        self.dt = find_dt(env, required_by="TakeOverWrapper") if dt is None else dt
+        self.dt = find_dt(env, required_by="TakeOverWrapper", given=dt)
         self.take_over = take_over
         self.record = record
         self._next_action: np.ndarray | None = None

@@ -6,28 +6,34 @@ import gymnasium as gym
 import numpy as np
 from stable_baselines3.common.vec_env import VecEnv
 
+from sb3_ctco.options import check_seconds
+
 #: What an error says of an environment that does not tell
 UNTOLD_DT = "does not tell its interaction period (no dt, control_timestep() or metadata['render_fps'])"
 
 
 @overload
-def find_dt(env: gym.Env, required_by: str) -> float: ...
+def find_dt(env: gym.Env, required_by: str, given: float | None = None) -> float: ...
 
 
 @overload
 def find_dt(env: gym.Env, required_by: None = None) -> float | None: ...
 
 
-def find_dt(env: gym.Env, required_by: str | None = None) -> float | None:
+def find_dt(env: gym.Env, required_by: str | None = None, given: float | None = None) -> float | None:
     """The interaction period of an environment, in s, from what it says of itself.
 
     Looked for, in this order: ``dt`` of the outermost layer that has it (a :class:`~sb3_ctco.wrappers.RealTimeWrapper`, or the
     environment itself), dm_control's ``control_timestep()``, ``1/metadata["render_fps"]``.
 
     :param required_by: names who needs it, in the error if the environment does not tell
+    :param given: what its user said, in s, which the environment is then not asked
     :return: the period in s, or None if the environment does not tell and nobody needs it
-    :raises ValueError: if somebody needs it
+    :raises ValueError: if somebody needs it, or what was given is not positive
     """
+    if given is not None:
+        check_seconds(dt=given)
+        return float(given)
     dt = env.get_wrapper_attr("dt") if env.has_wrapper_attr("dt") else None
     if dt is None:
         control_timestep = getattr(env.unwrapped, "control_timestep", None)

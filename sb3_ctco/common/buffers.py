@@ -21,10 +21,11 @@ from sb3_ctco.options import (
     RewardUnit,
     Stacked,
     SubOptions,
+    check_seconds,
     discount,
+    fit_sub_options,
     rows_of,
     shortest_steps,
-    sub_options,
     with_last_action,
 )
 
@@ -191,7 +192,7 @@ class _OptionStorage(ReplayBuffer):
         """Store stretches of a trajectory of primitive actions, whoever chose them, as options.
 
         From each of its steps on, random stretches of d_min to d_max, and at most to its end, are fitted as sub-options are
-        (:func:`~sb3_ctco.options.sub_options`). They are demonstrations: nothing overwrites them, and
+        (:func:`~sb3_ctco.options.fit_sub_options`). They are demonstrations: nothing overwrites them, and
         ``demonstration_fraction`` of each batch is drawn from them. Nothing is stored if anything is wrong.
 
         Options are in seconds, so the trajectory may have been recorded at another rate than the environment's. A stretch
@@ -218,8 +219,7 @@ class _OptionStorage(ReplayBuffer):
                 "this buffer does not know what options mean: add to the replay_buffer of a model that has an environment, or "
                 f"pass option_space and primitive_action_space (of OptionExecutionWrapper) to {type(self).__name__}"
             )
-        if not (dt > 0 and math.isfinite(dt)):
-            raise ValueError(f"dt must be a positive number of seconds, not {dt}")
+        check_seconds(dt=dt)
         reward_unit = reward_unit or self.reward_unit or "rate"
         if n_stretches < 1 or not tolerance >= 0 or reward_unit not in REWARD_UNITS:
             raise ValueError(
@@ -257,7 +257,7 @@ class _OptionStorage(ReplayBuffer):
             played = (plan[window], rewards[window], stretches, list(range(end - first + 1)), rows_of(seen, rows))
             ended = (terminated and end == n_steps, truncated and end == n_steps)
             before = None if sent is None else sent[rows]
-            parts.append(sub_options(space, *played, *ended, reward_unit, tolerance, before))
+            parts.append(fit_sub_options(space, *played, *ended, reward_unit, tolerance, before))
         added = sum(map(len, parts))
         if self.n_demonstrations + added >= self.buffer_size:
             raise ValueError(

@@ -19,7 +19,7 @@ from stable_baselines3.common.vec_env import VecEnv
 from sb3_ctco.common.load_arguments import check_load_arguments
 from sb3_ctco.dac_ppo.buffers import MDP, MDPS, DACDictRolloutBuffer, DACRolloutBuffer, DACRolloutSamples
 from sb3_ctco.dac_ppo.policies import CnnPolicy, DACPolicy, MlpPolicy, MultiInputPolicy
-from sb3_ctco.options import discount_rate_from_gamma
+from sb3_ctco.options import check_seconds, discount_rate_from_gamma
 from sb3_ctco.wrappers import OptionExecutionWrapper
 from sb3_ctco.wrappers.timing import UNTOLD_DT, find_dt_of_all
 
@@ -147,7 +147,7 @@ class DACPPO(OnPolicyAlgorithm):
                 f"n_epochs={n_epochs} and updates_per_second={updates_per_second} both say how often to update: "
                 "pass one of them"
             )
-        if updates_per_second is not None and not updates_per_second > 0:
+        if updates_per_second is not None and not 0 < updates_per_second < np.inf:
             raise ValueError(f"updates_per_second must be positive or None, not {updates_per_second}")
         if n_epochs is not None and n_epochs < 1:
             raise ValueError(f"n_epochs must be at least 1, not {n_epochs}")
@@ -157,8 +157,7 @@ class DACPPO(OnPolicyAlgorithm):
             raise ValueError(f"gae_lambda must be in [0, 1], not {gae_lambda}")
         # With one step as the unit of time γ is the discount of a step, so this checks its range as well.
         discount_rate_from_gamma(gamma, 1.0 if gamma_dt is None else gamma_dt)
-        if dt is not None and not (dt > 0 and np.isfinite(dt)):
-            raise ValueError(f"dt must be a positive number of seconds, not {dt}")
+        check_seconds(dt=dt)
         self.batch_size = batch_size
         self.n_epochs = 5 if n_epochs is None and updates_per_second is None else n_epochs
         self.updates_per_second = updates_per_second

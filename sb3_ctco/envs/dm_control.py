@@ -11,6 +11,8 @@ import gymnasium as gym
 import numpy as np
 from gymnasium import spaces
 
+from sb3_ctco.options import check_seconds
+
 try:
     import mujoco
     from mujoco.rollout import Rollout
@@ -73,9 +75,7 @@ class DMControlEnv(gym.Env[np.ndarray, np.ndarray]):
         height: int = 240,
         camera_id: int = 0,
     ):
-        for name, seconds in (("dt", dt), ("time_limit", time_limit)):
-            if seconds is not None and not (seconds > 0 and math.isfinite(seconds)):
-                raise ValueError(f"{name} must be a positive number of seconds, not {seconds}")
+        check_seconds(dt=dt, time_limit=time_limit)
         if render_mode not in (None, "rgb_array"):
             raise ValueError(f"render_mode must be None or 'rgb_array', not {render_mode!r}")
         if sparse and domain not in _SPARSE_REWARDS:

@@ -24,7 +24,7 @@ from sb3_ctco.figar_sac.policies import (
     decode_repetitions,
     encode_repetitions,
 )
-from sb3_ctco.options import OptionSpace, steps_in
+from sb3_ctco.options import OptionSpace, check_seconds, steps_in
 from sb3_ctco.wrappers import OptionExecutionWrapper, find_dt
 
 
@@ -132,8 +132,7 @@ class FiGARSAC(SoftOptionActorCritic):
                 raise TypeError(f"n_repetitions must be an integer, not {n_repetitions!r}")
             if n_repetitions < 1:
                 raise ValueError(f"n_repetitions must be at least 1, not {n_repetitions}")
-        elif not (d_max is not None and d_max > 0 and math.isfinite(d_max)):
-            raise ValueError(f"d_max must be a positive number of seconds, not {d_max}")
+        check_seconds(d_max=d_max)
         #: K; known once dt is, if it was given as ``d_max``
         self.n_repetitions = n_repetitions
         super().__init__(

@@ -24,6 +24,7 @@ from sb3_ctco.options.semi_mdp import (
     REWARD_UNITS,
     FloatArray,
     RewardUnit,
+    check_seconds,
     discount,
     discount_rate_from_gamma,
     discounts_of_steps,
@@ -41,7 +42,7 @@ from sb3_ctco.options.space import (
     OptionSpace,
     default_durations,
 )
-from sb3_ctco.options.sub_options import Stacked, SubOptions, draw_stretches, rows_of, shortest_steps, stack, sub_options
+from sb3_ctco.options.sub_options import Stacked, SubOptions, draw_stretches, fit_sub_options, rows_of, shortest_steps, stack
 from sb3_ctco.options.trajectory import TRAJECTORIES, BezierCurve, RadialBasis, Trajectory, basis_of_steps
 
 __all__ = [
@@ -72,18 +73,19 @@ __all__ = [
     "Trajectory",
     "ValueInterrupt",
     "basis_of_steps",
+    "check_seconds",
     "default_durations",
     "discount",
     "discount_rate_from_gamma",
     "discounts_of_steps",
     "draw_stretches",
+    "fit_sub_options",
     "integrated_reward",
     "rows_of",
     "shortest_steps",
     "stack",
     "step_weight",
     "steps_in",
-    "sub_options",
     "with_last_action",
     "with_last_action_space",
 ]

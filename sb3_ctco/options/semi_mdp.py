@@ -15,6 +15,17 @@ RewardUnit = Literal["rate", "impulse"]
 REWARD_UNITS: tuple[RewardUnit, ...] = ("rate", "impulse")
 
 
+def check_seconds(**seconds: float | None) -> None:
+    """Refuse times that are not positive and finite; None stands for a time that was not given.
+
+    :param seconds: times in s, by the names that their error gives them
+    :raises ValueError: if one is out of range
+    """
+    for name, value in seconds.items():
+        if value is not None and not (value > 0 and math.isfinite(value)):
+            raise ValueError(f"{name} must be a positive number of seconds, not {value}")
+
+
 def discount_rate_from_gamma(gamma: float = 0.98, gamma_dt: float = 0.05) -> float:
     """The paper's τ = −ln(γ_base)/dt_base (section "Empirical Analysis").
 
@@ -25,8 +36,7 @@ def discount_rate_from_gamma(gamma: float = 0.98, gamma_dt: float = 0.05) -> flo
     """
     if not 0.0 < gamma <= 1.0:
         raise ValueError(f"gamma must be in (0, 1], not {gamma}: it is the discount factor over gamma_dt seconds")
-    if not (gamma_dt > 0.0 and math.isfinite(gamma_dt)):
-        raise ValueError(f"gamma_dt must be a positive number of seconds, not {gamma_dt}")
+    check_seconds(gamma_dt=gamma_dt)
     return -math.log(gamma) / gamma_dt
 
 

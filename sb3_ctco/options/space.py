@@ -7,7 +7,7 @@ from typing import Any, Literal
 import numpy as np
 import numpy.typing as npt
 
-from sb3_ctco.options.semi_mdp import DEFAULT_DISCOUNT_RATE, FloatArray, steps_in
+from sb3_ctco.options.semi_mdp import DEFAULT_DISCOUNT_RATE, FloatArray, check_seconds, steps_in
 from sb3_ctco.options.trajectory import TRAJECTORIES, Trajectory
 
 DurationScale = Literal["log", "linear"]
@@ -55,14 +55,11 @@ class OptionSpace:
     d_min: float
     dt: float
     discount_rate: float
-    duration_scale: DurationScale = "linear"
-    join: Join = "free"
+    duration_scale: DurationScale
+    join: Join
 
     def __post_init__(self) -> None:
-        for name in ("dt", "d_max", "d_min"):
-            value = getattr(self, name)
-            if not (value > 0 and math.isfinite(value)):
-                raise ValueError(f"{name} must be a positive number of seconds, not {value}")
+        check_seconds(dt=self.dt, d_max=self.d_max, d_min=self.d_min)
         if self.d_min > self.d_max:
             raise ValueError(
                 f"d_min={self.d_min} s is longer than d_max={self.d_max} s: "
@@ -83,8 +80,8 @@ class OptionSpace:
         d_min: float,
         dt: float,
         discount_rate: float,
-        trajectory: str | type[Trajectory] = "rbf",
-        duration_scale: DurationScale = "linear",
+        trajectory: str | type[Trajectory] = "bezier",
+        duration_scale: DurationScale = "log",
         join: Join = "free",
     ) -> "OptionSpace":
         """An option space from the arguments that wrappers and algorithms take.

@@ -102,7 +102,7 @@ class SubOptions:
         return self
 
 
-def sub_options(
+def fit_sub_options(
     space: OptionSpace,
     plan: FloatArray,
     rewards: FloatArray,

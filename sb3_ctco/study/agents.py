@@ -45,8 +45,6 @@ def make_model(run: Run) -> BaseAlgorithm:
 
 def make_eval_env(run: Run, model: BaseAlgorithm) -> VecEnv:
     """An environment for the model to be evaluated in, seeded apart from training."""
-    env = ALGORITHMS[run.algorithm].make_eval_env(
-        model, lambda: find_task(run.task).make_env(run.rate), run.dt, discount_rate(run)
-    )
+    env = ALGORITHMS[run.algorithm].make_eval_env(model, lambda: find_task(run.task).make_env(run.rate))
     env.seed(10_000 + run.seed)
     return env

@@ -15,6 +15,7 @@ except ImportError as error:  # pragma: no cover
 
 from sb3_ctco.envs.visual_reacher.model import BAG_HALF_SIZE, JOINT_LIMITS, scene_xml
 from sb3_ctco.envs.visual_reacher.rendering import OffscreenCamera
+from sb3_ctco.options import check_seconds
 
 Difficulty = Literal["easy", "hard"]
 
@@ -109,9 +110,7 @@ class VisualReacherEnv(gym.Env[dict[str, np.ndarray], np.ndarray]):
     ):
         if difficulty not in ("easy", "hard"):
             raise ValueError(f"difficulty must be 'easy' or 'hard', not {difficulty!r}")
-        for name, seconds in (("dt", dt), ("time_limit", time_limit)):
-            if not (seconds > 0 and math.isfinite(seconds)):
-                raise ValueError(f"{name} must be a positive number of seconds, not {seconds}")
+        check_seconds(dt=dt, time_limit=time_limit)
         if not (bag_speed >= 0 and math.isfinite(bag_speed)):
             raise ValueError(f"bag_speed must be a number of m/s that is at least 0, not {bag_speed}")
         if render_mode not in (None, "rgb_array"):
