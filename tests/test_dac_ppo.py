@@ -470,6 +470,7 @@ def test_environments_of_another_dt_are_refused(scripted_env):
         ({"n_epochs": 3, "updates_per_second": 10.0}, "pass one of them"),
         ({"n_epochs": 0}, "n_epochs must be at least 1"),
         ({"n_epochs": None, "updates_per_second": 0.0}, "updates_per_second must be positive"),
+        ({"n_epochs": None, "updates_per_second": np.inf}, "updates_per_second must be positive"),
         ({"gamma": 0.0}, "gamma must be in"),
         ({"gamma": 1.1, "gamma_dt": None}, "gamma must be in"),
         ({"gamma_dt": 0.0}, "gamma_dt must be"),

@@ -1,7 +1,6 @@
 """It learns. Hyperparameters are fixed here; the seeds are those that were tried first."""
 
 import gymnasium as gym
-import numpy as np
 import pytest
 from stable_baselines3.common.evaluation import evaluate_policy
 
@@ -28,5 +27,4 @@ def test_pendulum_within_20000_steps(seed):
     )
     model.learn(20_000)
     mean, _ = evaluate_policy(model, model.wrap_env(gym.make("Pendulum-v1")), n_eval_episodes=20)
-    assert np.isfinite(mean)
     assert mean > -400

@@ -443,14 +443,29 @@ def test_what_cannot_be_sliced_is_refused(random_walk_env):
 
 
 def test_the_residual_is_logged(random_walk_env):
+    """The mean of what was fitted since the last log."""
     model = make(random_walk_env(), d_max=1.5)
     model.learn(0)
-    values = {}
+    logged, expected, seen = [], [], []
     dump = model.logger.dump
-    model.logger.dump = lambda step: values.update(model.logger.name_to_value) or dump(step)
+
+    def compare_and_dump(step):
+        logged.append(model.logger.name_to_value["option/slice_residual"])
+        expected.append(np.mean(seen))
+        seen.clear()
+        dump(step)
+
+    def watch(local_variables, global_variables):
+        for info in local_variables["infos"]:
+            seen.extend(info["sub_options"].residuals if "sub_options" in info else [])
+        return True
+
+    model.logger.dump = compare_and_dump
     model._custom_logger = True
-    model.learn(200)
-    assert 0 <= values["option/slice_residual"] <= 0.1
+    model.learn(400, callback=watch)
+    assert len(logged) >= 2
+    assert min(logged) > 0
+    assert logged == pytest.approx(expected)
 
 
 def test_an_option_has_fewer_sub_options_than_steps():
