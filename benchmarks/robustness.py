@@ -31,7 +31,8 @@ from sb3_ctco import OptionController
 from sb3_ctco.common.option_algorithm import OptionOffPolicyAlgorithm
 from sb3_ctco.options import discount, step_weight
 from sb3_ctco.registry import ALGORITHMS, find_task
-from sb3_ctco.study.agents import constructor_arguments, discount_rate
+from sb3_ctco.study.agents import constructor_arguments
+from sb3_ctco.study.agents import discount_rate as discount_rate_of
 from sb3_ctco.study.grid import Run
 from sb3_ctco.study.runs import RECORD, SETTINGS
 
@@ -75,7 +76,12 @@ def act_of(run: Run, folder: Path) -> Callable[[float], Callable[[np.ndarray, fl
 
 
 def play(
-    env: gym.Env, act: Callable[[np.ndarray, float], np.ndarray], dt: float, ticks: Iterator[int], age: float, tau: float
+    env: gym.Env,
+    act: Callable[[np.ndarray, float], np.ndarray],
+    dt: float,
+    ticks: Iterator[int],
+    age: float,
+    discount_rate: float,
 ) -> float:
     """Discounted return of an episode.
 
@@ -92,7 +98,7 @@ def play(
             until += next(ticks)
         obs, reward, terminated, truncated, _ = env.step(action)
         seen.append(obs)
-        value += float(discount(step * dt, tau)) * float(reward) * step_weight(dt, tau)
+        value += float(discount(step * dt, discount_rate)) * float(reward) * step_weight(dt, discount_rate)
         step += 1
         done = terminated or truncated
     return value
@@ -100,7 +106,7 @@ def play(
 
 def measure(run: Run, folder: Path, episodes: int) -> Iterator[tuple[Any, ...]]:
     """A row an episode."""
-    make_act, tau = act_of(run, folder), discount_rate(run)
+    make_act, discount_rate = act_of(run, folder), discount_rate_of(run)
     rng = np.random.default_rng(run.seed)
 
     def returns(rate: float, dt: float, share: float, age: float) -> Iterator[float]:
@@ -109,7 +115,7 @@ def measure(run: Run, folder: Path, episodes: int) -> Iterator[tuple[Any, ...]]:
         env.reset(seed=10_000 + run.seed)
         for _ in range(episodes):
             ticks = iter(lambda: max(1, round(dt * rate * (1 + share * rng.uniform(-1, 1)))), 0)
-            yield play(env, make_act(dt), 1 / rate, ticks, age, tau)
+            yield play(env, make_act(dt), 1 / rate, ticks, age, discount_rate)
         env.close()
 
     cell = run.task, run.algorithm, run.setting, run.rate, run.seed

@@ -13,6 +13,8 @@ import subprocess
 import sys
 from pathlib import Path
 
+from sb3_ctco.study.runs import git_commit
+
 FOLDER = Path(__file__).parent
 README = FOLDER / "README.md"
 #: Each script prints one table.
@@ -23,9 +25,8 @@ PACKAGES = ("stable-baselines3", "gymnasium", "torch", "numpy", "mujoco", "dm-co
 def setting() -> str:
     """The machine, versions and commit."""
     versions = ", ".join(f"{name} {importlib.metadata.version(name)}" for name in PACKAGES)
-    return (
-        f"{cpu_name()}, {os.cpu_count()} cores, one thread; Python {platform.python_version()}, {versions}; commit {commit()}"
-    )
+    machine = f"{cpu_name()}, {os.cpu_count()} cores, one thread"
+    return f"{machine}; Python {platform.python_version()}, {versions}; commit `{git_commit()}`"
 
 
 def cpu_name() -> str:
@@ -33,12 +34,6 @@ def cpu_name() -> str:
     cpuinfo = Path("/proc/cpuinfo")
     names = re.findall(r"model name\s*: (.*)", cpuinfo.read_text()) if cpuinfo.exists() else []
     return names[0] if names else platform.processor() or platform.machine()
-
-
-def commit() -> str:
-    """The commit that runs, marked if files differ from it."""
-    command = ["git", "describe", "--always", "--dirty", "--exclude=*"]
-    return f"`{subprocess.run(command, cwd=FOLDER, capture_output=True, text=True, check=True).stdout.strip()}`"
 
 
 def table_of(script: str) -> str:

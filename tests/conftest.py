@@ -101,6 +101,21 @@ class RandomWalkEnv(gym.Env):
         return image if self.kind == "image" else {"image": image, "vector": vector}
 
 
+class FakeClock:
+    """Time passes when somebody sleeps, and when the test says so."""
+
+    def __init__(self):
+        self.time = 100.0
+        self.slept = []
+
+    def now(self):
+        return self.time
+
+    def sleep(self, seconds):
+        self.slept.append(seconds)
+        self.time += seconds
+
+
 @pytest.fixture
 def scripted_env() -> type[ScriptedEnv]:
     return ScriptedEnv

@@ -6,25 +6,11 @@ import time
 import gymnasium as gym
 import numpy as np
 import pytest
+from conftest import FakeClock
 from gymnasium import spaces
 
 from sb3_ctco.options import integrated_reward
 from sb3_ctco.wrappers import OptionExecutionWrapper, RealTimeOptionWrapper, RealTimeWrapper
-
-
-class FakeClock:
-    """Time passes when somebody sleeps, and when the test says so."""
-
-    def __init__(self):
-        self.time = 100.0
-        self.slept = []
-
-    def now(self):
-        return self.time
-
-    def sleep(self, seconds):
-        self.slept.append(seconds)
-        self.time += seconds
 
 
 class Simulation(gym.Env):

@@ -5,6 +5,7 @@ import tracemalloc
 import gymnasium as gym
 import numpy as np
 import pytest
+from conftest import FakeClock
 from gymnasium import spaces
 
 from sb3_ctco import OptionController
@@ -244,16 +245,6 @@ def test_smooth_commands_pass_as_they_are():
     np.testing.assert_allclose(commands(Safety(), targets), targets, atol=1e-6)
 
 
-class Clock:
-    time = 0.0
-
-    def now(self):
-        return self.time
-
-    def sleep(self, seconds):
-        self.time += seconds
-
-
 class Machine(gym.Env):
     """Commands arrive; its observations are of age ``age``; the action that it is sending at first is −1."""
 
@@ -275,24 +266,24 @@ class Machine(gym.Env):
 
 
 def test_commands_to_a_machine_are_limited_and_those_to_a_simulation_are_not():
-    env = RealTimeWrapper(Machine(), clock=Clock(), safety=Safety(max_rate=2.0, max_slew=None))
+    env = RealTimeWrapper(Machine(), clock=FakeClock(), safety=Safety(max_rate=2.0, max_slew=None))
     env.reset()
     for _ in range(4):
         env.step(np.ones(1))
     assert env.unwrapped.commands == [-0.6, -0.2, 0.2, 0.6]  # 0.4 of a width of 2 in 0.1 s at 2/s: from what is being sent
 
-    assert RealTimeWrapper(Machine(), clock=Clock()).guard.safety == Safety()
+    assert RealTimeWrapper(Machine(), clock=FakeClock()).guard.safety == Safety()
 
     class Simulation(Machine):
         send = receive = None
 
-    assert RealTimeWrapper(Simulation(), clock=Clock()).guard is None
-    assert RealTimeWrapper(Machine(), clock=Clock(), safety=None).guard is None
+    assert RealTimeWrapper(Simulation(), clock=FakeClock()).guard is None
+    assert RealTimeWrapper(Machine(), clock=FakeClock(), safety=None).guard is None
 
 
 def test_an_old_observation_ends_the_option(caplog):
     machine = Machine()
-    env = RealTimeWrapper(machine, clock=Clock(), safety=Safety(stale_after=0.3, safe_action="zero", **UNLIMITED))
+    env = RealTimeWrapper(machine, clock=FakeClock(), safety=Safety(stale_after=0.3, safe_action="zero", **UNLIMITED))
     env = RealTimeOptionWrapper(env, n_rbf=1, d_max=1.0)
     env.reset()
     machine.age = 0.5
@@ -313,7 +304,7 @@ def test_an_old_observation_ends_the_option(caplog):
 
 
 def limited_machine(wrapper, **kwargs):
-    env = RealTimeWrapper(Machine(), clock=Clock(), safety=Safety(max_rate=2.0, max_slew=None, stale_after=0.3))
+    env = RealTimeWrapper(Machine(), clock=FakeClock(), safety=Safety(max_rate=2.0, max_slew=None, stale_after=0.3))
     return wrapper(env, n_rbf=1, d_max=0.3, join="continuous", **kwargs)
 
 
@@ -353,7 +344,7 @@ def test_the_rest_of_an_option_is_told_from_what_was_sent():
 @pytest.mark.parametrize("join", JOINS)
 def test_an_option_that_is_not_finite(ahead, join):
     machine = Machine()
-    env = RealTimeWrapper(machine, clock=Clock(), safety=Safety(safe_action="hold", **UNLIMITED))
+    env = RealTimeWrapper(machine, clock=FakeClock(), safety=Safety(safe_action="hold", **UNLIMITED))
     env = RealTimeOptionWrapper(env, ahead, n_rbf=1, d_max=1.0, join=join, background=bool(ahead))
     env.reset()
     env.step([0.5, 1.0])
@@ -371,7 +362,7 @@ def test_an_option_that_is_not_finite(ahead, join):
     assert machine.commands[12] == pytest.approx({"free": 0.25, "continuous": 0.475, "smooth": 0.4975}[join])
     assert "taken_over" not in info
     assert env.get_wrapper_attr("total_statistics").safe_ticks == 2
-    unguarded = RealTimeOptionWrapper(RealTimeWrapper(Machine(), clock=Clock(), safety=None), n_rbf=1, d_max=1.0)
+    unguarded = RealTimeOptionWrapper(RealTimeWrapper(Machine(), clock=FakeClock(), safety=None), n_rbf=1, d_max=1.0)
     unguarded.reset()
     with pytest.raises(ValueError, match="must be finite"):
         unguarded.step([np.nan, 1.0])
@@ -386,7 +377,7 @@ def test_the_safe_action_ends_an_option_in_the_plain_wrapper_too():
             return obs, reward, terminated, truncated, {**info, "observation_age": 9.9 if len(self.commands) == 2 else 0.0}
 
     machine = Blind()
-    env = OptionExecutionWrapper(RealTimeWrapper(machine, clock=Clock(), safety=Safety(**UNLIMITED)), n_rbf=1, d_max=1.0)
+    env = OptionExecutionWrapper(RealTimeWrapper(machine, clock=FakeClock(), safety=Safety(**UNLIMITED)), n_rbf=1, d_max=1.0)
     env.reset()
     *_, info = env.step([0.5, 1.0])
     assert info["option"]["n_steps"] == len(machine.commands) == 3
@@ -398,7 +389,7 @@ def test_the_safe_action_ends_an_option_in_the_plain_wrapper_too():
 
 def test_an_observation_grows_old_while_somebody_decides():
     """0.2 s is as old as it may be: after 0.15 s of thinking it is acted on, after 60 s it is not, and the next one is."""
-    clock, machine = Clock(), Machine()
+    clock, machine = FakeClock(), Machine()
     env = RealTimeWrapper(machine, clock=clock, safety=Safety(stale_after=0.2, **UNLIMITED))
     env.reset()
     for thinking in (0.0, 0.15, 60.0, 0.0):
@@ -502,7 +493,7 @@ def test_one_of_several_robots_begins_from_what_is_sent_to_it():
 
 def test_what_was_sent_is_asked_in_the_machines_actions_only():
     def rescaled(**kwargs):
-        return gym.wrappers.RescaleAction(RealTimeWrapper(Machine(), clock=Clock(), **kwargs), -2.0, 2.0)
+        return gym.wrappers.RescaleAction(RealTimeWrapper(Machine(), clock=FakeClock(), **kwargs), -2.0, 2.0)
 
     with pytest.raises(ValueError, match=r"join='continuous' needs to know what was sent.*safety=None"):
         OptionExecutionWrapper(rescaled(), join="continuous")

@@ -302,7 +302,7 @@ def test_several_environments_and_other_observations(random_walk_env, kind):
 
 
 def test_images_that_sb3_transposes(random_walk_env):
-    class ChannelsLast(gym.ObservationWrapper):
+    class SevenFirst(gym.ObservationWrapper):
         dt = 0.1
 
         def __init__(self, env):
@@ -314,7 +314,7 @@ def test_images_that_sb3_transposes(random_walk_env):
             obs[..., 0] = 7
             return obs
 
-    model = make(ChannelsLast(random_walk_env("image")), "CnnPolicy", buffer_size=500).learn(40)
+    model = make(SevenFirst(random_walk_env("image")), "CnnPolicy", buffer_size=500).learn(40)
     buffer = model.replay_buffer
     images = buffer.observations[: buffer.pos, 0]
     assert images.shape[1:] == (3, 36, 36)
@@ -322,7 +322,7 @@ def test_images_that_sb3_transposes(random_walk_env):
     assert buffer.pos > 20
 
 
-class ChannelsLast(gym.ObservationWrapper):
+class MovingImages(gym.ObservationWrapper):
     """Images in which each pixel is another, and that change with the state."""
 
     dt = 0.1
@@ -341,7 +341,7 @@ class ChannelsLast(gym.ObservationWrapper):
 @pytest.mark.parametrize("kind", ["image", "dict"])
 @pytest.mark.parametrize("algorithm", ["SAC", "CTCO"])
 def test_images_with_channels_last_are_transposed_and_not_reshaped(random_walk_env, kind, algorithm):
-    env = OptionExecutionWrapper(ChannelsLast(random_walk_env(kind)), n_rbf=3, d_max=1.0, n_sub_options=4)
+    env = OptionExecutionWrapper(MovingImages(random_walk_env(kind)), n_rbf=3, d_max=1.0, n_sub_options=4)
     policy = "CnnPolicy" if kind == "image" else "MultiInputPolicy"
     if algorithm == "SAC":
         buffer_class = OptionReplayBuffer if kind == "image" else DictOptionReplayBuffer

@@ -27,6 +27,11 @@ from sb3_ctco.figar_sac.policies import (
 from sb3_ctco.options import OptionSpace, check_seconds, steps_in
 from sb3_ctco.wrappers import OptionExecutionWrapper, find_dt
 
+#: Options that hold an action for a whole number of steps
+REPETITIONS: dict[str, Any] = {"n_rbf": 1, "d_min": 0.0, "duration_scale": "linear"}
+#: K, of Sharma et al.
+DEFAULT_REPETITIONS = 20
+
 
 class FiGARSAC(SoftOptionActorCritic):
     """Fine-Grained Action Repetition on soft actor-critic (FiGAR-SAC).
@@ -126,7 +131,7 @@ class FiGARSAC(SoftOptionActorCritic):
                 "pass one of them"
             )
         if n_repetitions is None and d_max is None:
-            n_repetitions = 20
+            n_repetitions = DEFAULT_REPETITIONS
         if n_repetitions is not None:
             if isinstance(n_repetitions, bool) or not isinstance(n_repetitions, int | np.integer):
                 raise TypeError(f"n_repetitions must be an integer, not {n_repetitions!r}")
@@ -139,11 +144,9 @@ class FiGARSAC(SoftOptionActorCritic):
             policy,
             env,
             learning_rate,
-            n_rbf=1,
+            **REPETITIONS,
             d_max=d_max,
-            d_min=0.0,
             dt=dt,
-            duration_scale="linear",
             gamma=gamma,
             gamma_dt=gamma_dt,
             updates_per_second=updates_per_second,
@@ -184,11 +187,10 @@ class FiGARSAC(SoftOptionActorCritic):
                 "in seconds, or dt"
             )
         if d_max is None:
-            d_max = (20 if n_repetitions is None else n_repetitions) * dt
+            d_max = (DEFAULT_REPETITIONS if n_repetitions is None else n_repetitions) * dt
         elif dt is not None:
             d_max = steps_in(d_max, dt) * dt
-        fixed = {"n_rbf": 1, "d_min": 0.0, "duration_scale": "linear", "join": "free"}
-        return super().wrapper_kwargs({**arguments, **fixed, "d_max": d_max})
+        return super().wrapper_kwargs({**arguments, **REPETITIONS, "join": "free", "d_max": d_max})
 
     def _resolve_repetitions(self, dt: float) -> None:
         """Make ``n_repetitions`` and ``d_max``, of which the user gave one, say the same at the first dt that is known."""
