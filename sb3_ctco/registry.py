@@ -85,7 +85,10 @@ def find_task(name: str) -> Task:
     :raises ValueError: if there is none
     """
     if not isinstance(name, str) or name not in {*TASKS, *gym.registry}:
-        raise ValueError(f"there is no task {name!r}: name one of {list(TASKS)}, or an id of Gymnasium's registry")
+        raise ValueError(
+            f"there is no task {name!r}: name one of {list(TASKS)}, or an id of Gymnasium's registry; of your own "
+            "environments --gym-packages names the module that registers them"
+        )
     if name in TASKS:
         return TASKS[name]
     if gym.spec(name).entry_point == "sb3_ctco.envs.dm_control:DMControlEnv" and "dt" not in gym.spec(name).kwargs:

@@ -13,6 +13,7 @@ import sys
 import time
 from pathlib import Path
 
+import gymnasium
 import matplotlib as mpl
 import numpy as np
 import pytest
@@ -1040,6 +1041,8 @@ def test_interquartile_means_of_costs_stand_upright():
         ({"learning_starts_seconds": "1m"}, "learning_starts_seconds='1m', which must be a number of at least 0"),
         ({"learning_starts_seconds": None}, "learning_starts_seconds=None, which must be a number"),
         ({"policy_kwargs": {"features_extractor_class": 5}}, "there is no features_extractor_class 5"),
+        ({"policy_kwargs": {"features_extractor_class": "subprocess.Popen"}}, "no features_extractor_class subprocess.Popen"),
+        ({"policy_kwargs": {"features_extractor_class": "this.x"}}, "there is no features_extractor_class this.x"),
     ],
 )
 def test_arguments_that_cannot_be_right_are_named(changes, message, tmp_path):
@@ -1049,6 +1052,39 @@ def test_arguments_that_cannot_be_right_are_named(changes, message, tmp_path):
     file.write_text(yaml.safe_dump(preset))
     with pytest.raises(ValueError, match=message):
         agents.constructor_arguments(load_preset(str(file)).select()[0])
+    assert "this" not in sys.modules  # to look a name up runs nothing
+
+
+OWN_ENVIRONMENT = """
+import gymnasium as gym
+from gymnasium.envs.classic_control import PendulumEnv
+
+
+class Swing(PendulumEnv):
+    pass
+
+
+gym.register("Swing-v0", Swing, max_episode_steps=200)
+"""
+
+
+def test_an_environment_of_one_s_own_is_a_task(tmp_path, monkeypatch, few_resamples, capsys):
+    (tmp_path / "my_swing.py").write_text(OWN_ENVIRONMENT)
+    monkeypatch.setenv("PYTHONPATH", str(tmp_path), prepend=":")  # of the workers
+    monkeypatch.syspath_prepend(str(tmp_path))
+    preset = tiny(tmp_path, tasks=["Swing-v0"], rates=[20], seeds=1)
+    command = ["run", "--preset", preset, "--folder", str(tmp_path / "study"), "--workers", "1"]
+    assert main(command) == 1
+    assert "--gym-packages names the module that registers them" in capsys.readouterr().err
+    try:
+        assert main([*command, "--gym-packages", "my_swing"]) == 0
+        assert main(["plot", str(tmp_path / "study"), "--gym-packages", "my_swing"]) == 0
+        assert "Swing-v0" in (tmp_path / "study" / "figures" / "table.md").read_text()
+        assert main([*command, "--gym-packages", "no_such_module"]) == 1
+        assert "--gym-packages no_such_module cannot be imported" in capsys.readouterr().err
+    finally:
+        gymnasium.registry.pop("Swing-v0", None)
+        sys.modules.pop("my_swing", None)
 
 
 def test_an_id_of_one_rate_has_episodes_as_long_as_it_says():

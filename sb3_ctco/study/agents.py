@@ -1,12 +1,14 @@
 """From a run's settings to a model to train, and an environment to evaluate it in."""
 
 import copy
-import pydoc
+import sys
 from typing import Any
 
 from stable_baselines3.common.base_class import BaseAlgorithm
+from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
 from stable_baselines3.common.vec_env import VecEnv
 
+import sb3_ctco.torch_layers  # noqa: F401 (whose features extractors presets name)
 from sb3_ctco.options import discount_rate_from_gamma
 from sb3_ctco.registry import ALGORITHMS, find_task
 from sb3_ctco.study.grid import Run
@@ -25,9 +27,14 @@ def constructor_arguments(run: Run) -> dict[str, Any]:
     policy_kwargs = arguments.get("policy_kwargs") or {}
     if "features_extractor_class" in policy_kwargs:
         name = policy_kwargs["features_extractor_class"]
-        extractor = pydoc.locate(name) if isinstance(name, str) else None
-        if extractor is None:
-            raise ValueError(f"{where}: there is no features_extractor_class {name}; give its full name, module.Class")
+        # Of what is imported already: to read a preset imports nothing, and runs nothing that is no features extractor.
+        module, _, class_name = name.rpartition(".") if isinstance(name, str) else ("", "", "")
+        extractor = getattr(sys.modules.get(module), class_name, None)
+        if not (isinstance(extractor, type) and issubclass(extractor, BaseFeaturesExtractor)):
+            raise ValueError(
+                f"{where}: there is no features_extractor_class {name}; give its full name, module.Class, and your own "
+                "module's to --gym-packages"
+            )
         arguments["policy_kwargs"] = {**policy_kwargs, "features_extractor_class": extractor}
     return arguments
 

@@ -57,6 +57,7 @@ def _parser() -> argparse.ArgumentParser:
     run.add_argument("--costs", type=Path, nargs="+", default=[], metavar="CSV", help="for --hours: more files of `collect`")
     for name, kind in {"tasks": str, "rates": int, "algorithms": str, "settings": str}.items():
         run.add_argument(f"--{name}", nargs="+", type=kind, help=f"only these {name} of the preset")
+    run.add_argument("--gym-packages", nargs="+", default=[], metavar="MODULE", help="import these, which register your tasks")
     run.add_argument("--seeds", nargs="+", type=int, help="these in place of the preset's, which begin at 0")
     run.set_defaults(call=_run)
 
@@ -74,13 +75,14 @@ def _parser() -> argparse.ArgumentParser:
     plot.add_argument("--output", type=Path, metavar="DIR", help="SOURCE/figures by default, or figures beside the file")
     plot.add_argument("--algorithms", nargs="+", help="only these")
     plot.add_argument("--settings", nargs="+", help="only these, but for the figure pareto; best is the best action repeat")
+    plot.add_argument("--gym-packages", nargs="+", default=[], metavar="MODULE", help="as for run")
     plot.set_defaults(call=_plot)
     return parser
 
 
 def _run(args: argparse.Namespace) -> int:
     from sb3_ctco.study.agents import constructor_arguments
-    from sb3_ctco.study.engines import run_local, run_on_ray
+    from sb3_ctco.study.engines import import_packages, run_local, run_on_ray
     from sb3_ctco.study.grid import load_preset
     from sb3_ctco.study.records import without_recorded
     from sb3_ctco.study.runs import RECORD, plan
@@ -91,6 +93,7 @@ def _run(args: argparse.Namespace) -> int:
         raise ValueError(f"--hours must be positive and is for --engine local, not {args.hours} with {args.engine}")
     if args.address and args.engine != "ray":
         raise ValueError(f"--address {args.address} is Ray's: add --engine ray")
+    import_packages(args.gym_packages)
     preset = load_preset(args.preset)
     runs = preset.select(args.tasks, args.rates, args.algorithms, args.settings, args.seeds)
     for run in runs:
@@ -111,9 +114,9 @@ def _run(args: argparse.Namespace) -> int:
         left, may_begin = _in_time(args, left, folder, workers)
         runs = [run for run in runs if run in left or (folder / run.name / RECORD).exists()]
     if args.engine == "ray":
-        outcomes = run_on_ray(left, folder, workers, args.address)
+        outcomes = run_on_ray(left, folder, workers, args.address, args.gym_packages)
     else:
-        outcomes = run_local(left, folder, workers, may_begin or (lambda run: True))
+        outcomes = run_local(left, folder, workers, may_begin or (lambda run: True), args.gym_packages)
     states = set()
     with _Progress(folder, runs, workers):
         for outcome in outcomes:
@@ -163,8 +166,10 @@ def _collect(args: argparse.Namespace) -> int:
 
 
 def _plot(args: argparse.Namespace) -> int:
+    from sb3_ctco.study.engines import import_packages
     from sb3_ctco.study.plots import plot
 
+    import_packages(args.gym_packages)
     first = args.sources[0]
     output = args.output or (first if first.is_dir() else first.parent) / "figures"
     for file in plot(args.sources, output, args.algorithms, args.settings):

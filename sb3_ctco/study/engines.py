@@ -1,6 +1,7 @@
 """Where runs are made: in worker processes of this machine, or on Ray."""
 
 import contextlib
+import importlib
 import logging
 import multiprocessing
 import os
@@ -23,7 +24,11 @@ _THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMEX
 
 
 def run_local(
-    runs: Sequence[Run], folder: Path, workers: int, may_begin: Callable[[Run], bool] = lambda run: True
+    runs: Sequence[Run],
+    folder: Path,
+    workers: int,
+    may_begin: Callable[[Run], bool] = lambda run: True,
+    gym_packages: Sequence[str] = (),
 ) -> Iterator[Outcome]:
     """Make runs in processes of this machine, one a worker with one thread.
 
@@ -35,6 +40,7 @@ def run_local(
     :param folder: the study's
     :param workers: number of processes
     :param may_begin: asked of each run when a process is free for it; one that may not is left out
+    :param gym_packages: modules that register environments
     :return: what became of each run, in the order in which they end
     """
     waiting, deaths, seen_busy = deque(runs), Counter[str](), set[str]()
@@ -46,7 +52,7 @@ def run_local(
                 run = waiting.popleft()
                 if not may_begin(run):
                     continue
-                connection, process = idle.pop() if idle else _start_worker(folder)
+                connection, process = idle.pop() if idle else _start_worker(folder, gym_packages)
                 at_work[connection] = process, run
                 with contextlib.suppress(BrokenPipeError):  # it has died, as is found below
                     connection.send(run)
@@ -81,10 +87,10 @@ def run_local(
             process.join()
 
 
-def _start_worker(folder: Path) -> tuple[Connection, BaseProcess]:
+def _start_worker(folder: Path, gym_packages: Sequence[str]) -> tuple[Connection, BaseProcess]:
     context = multiprocessing.get_context("spawn")
     connection, end_of_worker = context.Pipe()
-    process = context.Process(target=_work, args=(end_of_worker, folder), daemon=True)
+    process = context.Process(target=_work, args=(end_of_worker, folder, gym_packages), daemon=True)
     before = {name: os.environ.get(name) for name in _THREADS}
     os.environ.update(dict.fromkeys(_THREADS, "1"))
     try:
@@ -99,13 +105,32 @@ def _start_worker(folder: Path) -> tuple[Connection, BaseProcess]:
     return connection, process
 
 
-def _work(connection: Connection, folder: Path) -> None:
+def _work(connection: Connection, folder: Path, gym_packages: Sequence[str]) -> None:
     mute_deprecated_attributes()
     threading.Thread(target=_end_with_the_study, daemon=True).start()
     # Until the study closes its end, or somebody presses Ctrl-C, which reaches every process of the terminal.
     with contextlib.suppress(EOFError, KeyboardInterrupt):
         while True:
-            connection.send(perform(connection.recv(), folder))
+            connection.send(_perform(connection.recv(), folder, gym_packages))
+
+
+def _perform(run: Run, folder: Path, gym_packages: Sequence[str]) -> Outcome:
+    import_packages(gym_packages)
+    return perform(run, folder)
+
+
+def import_packages(names: Sequence[str]) -> None:
+    """Import modules, which register environments, as RL Zoo's ``--gym-packages`` does.
+
+    :raises ValueError: if one cannot be imported
+    """
+    for name in names:
+        try:
+            importlib.import_module(name)
+        except ImportError as error:
+            raise ValueError(
+                f"--gym-packages {name} cannot be imported: {error}; for a file in this folder, run PYTHONPATH=. sb3-ctco ..."
+            ) from error
 
 
 def _end_with_the_study() -> None:
@@ -115,13 +140,16 @@ def _end_with_the_study() -> None:
     os._exit(1)  # Nobody waits for this run any more. The next study begins it again.
 
 
-def run_on_ray(runs: Sequence[Run], folder: Path, workers: int, address: str | None) -> Iterator[Outcome]:
+def run_on_ray(
+    runs: Sequence[Run], folder: Path, workers: int, address: str | None, gym_packages: Sequence[str] = ()
+) -> Iterator[Outcome]:
     """Make runs on Ray, one CPU each; Ray begins a run again whose process or machine died.
 
     :param runs: the runs, planned in the folder
     :param folder: the study's, in a file system that all machines share
     :param workers: number of processes of a Ray that is started here
     :param address: of a running cluster, such as ``"auto"``; None to start Ray here
+    :param gym_packages: modules that register environments
     :return: what became of each run, in the order in which they end
     :raises ImportError: if Ray is not installed
     """
@@ -139,8 +167,8 @@ def run_on_ray(runs: Sequence[Run], folder: Path, workers: int, address: str | N
         log_to_driver=False,
     )
     try:
-        task = ray.remote(num_cpus=1, max_retries=RETRIES)(perform)
-        pending = {task.remote(run, folder): run for run in runs}
+        task = ray.remote(num_cpus=1, max_retries=RETRIES)(_perform)
+        pending = {task.remote(run, folder, gym_packages): run for run in runs}
         while pending:
             (ready,), _ = ray.wait(list(pending), num_returns=1)
             run = pending.pop(ready)
