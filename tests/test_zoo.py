@@ -33,7 +33,7 @@ TUNED = {
     *(
         f"sb3_ctco/{task}-{rate}hz-v0"
         for task in ("point_mass-sparse", "cheetah-run", "ball_in_cup-catch")
-        for rate in (50, 500)
+        for rate in (50, 100, 250, 500)
     ),
     *(f"sb3_ctco/visual_reacher-{difficulty}-v0" for difficulty in ("easy", "hard")),
 }
