@@ -123,9 +123,14 @@ class _EpisodeTracker:
     discount_rate: float
     dt: float | None
     running: list[EpisodeStatistics] = field(init=False)
+    #: Primitive steps of the running episodes, and of those that ended last
+    n_steps: list[int] = field(init=False)
+    n_steps_of_last: list[int] = field(init=False)
 
     def __post_init__(self) -> None:
         self.running = [EpisodeStatistics() for _ in range(self.n_envs)]
+        self.n_steps = [0] * self.n_envs
+        self.n_steps_of_last = [0] * self.n_envs
 
     def step(self, rewards: np.ndarray, dones: np.ndarray, infos: list[dict[str, Any]]) -> dict[int, EpisodeStatistics]:
         """Account for one step of each environment.
@@ -146,12 +151,14 @@ class _EpisodeTracker:
             episode.discounted_return += float(discount(episode.seconds, self.discount_rate)) * integral
             episode.seconds += duration
             episode.decisions += 1
+            self.n_steps[i] += info["option"]["n_steps"] if "option" in info else 1
             episode.episode_return += float(reward)
             if done:
                 if "episode" in info:
                     episode.episode_return = info["episode"]["r"]
                 ended[i] = episode
                 self.running[i] = EpisodeStatistics()
+                self.n_steps_of_last[i], self.n_steps[i] = self.n_steps[i], 0
         return ended
 
 
@@ -252,18 +259,30 @@ class DiscountedReturnCallback(BaseCallback):
         super().__init__()
         self.discount_rate = discount_rate
         self.dt = dt
+        self._tracker: _EpisodeTracker | None = None
         #: Episodes in the order of their ends, and the algorithm's number of steps then.
         self.episodes: list[EpisodeStatistics] = []
         self.timesteps: list[int] = []
 
     def _on_training_start(self) -> None:
-        rate = _find_discount_rate(self.training_env, self.discount_rate)
-        self._tracker = _EpisodeTracker(self.training_env.num_envs, rate, self.dt)
+        env, goes_on = self.training_env, self.locals.get("reset_num_timesteps") is False
+        if not (goes_on and self._tracker is not None and self._tracker.n_envs == env.num_envs):
+            self._tracker = _EpisodeTracker(env.num_envs, _find_discount_rate(env, self.discount_rate), self.dt)
+        # Episodes that run already may not have been seen from their beginning, or may never end.
+        self._torn = set(range(env.num_envs)) if goes_on else set()
 
     def _on_step(self) -> bool:
         infos = self.locals["infos"]
         if infos[0]:  # empty at the ticks between two decisions
-            ended = self._tracker.step(_as_paid(self.training_env, self.locals["rewards"]), self.locals["dones"], infos)
+            assert self._tracker is not None
+            rewards, dones = _as_paid(self.training_env, self.locals["rewards"]), self.locals["dones"]
+            ended = self._tracker.step(rewards, dones, infos)
+            for i in self._torn & ended.keys():
+                self._torn.remove(i)
+                # By Monitor's count, of steps, or of decisions where it is outside of them.
+                length = infos[i].get("episode", {}).get("l")
+                if length is not None and length not in (ended[i].decisions, self._tracker.n_steps_of_last[i]):
+                    del ended[i]
             if ended:
                 self.episodes += ended.values()
                 self.timesteps += [self.num_timesteps] * len(ended)

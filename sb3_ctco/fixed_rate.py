@@ -1,6 +1,8 @@
 """Stable-Baselines3's SAC under the clock that the algorithms with options use."""
 
-from typing import Any
+import io
+import pathlib
+from typing import Any, TypeVar
 
 import gymnasium as gym
 import numpy as np
@@ -15,14 +17,18 @@ from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.preprocessing import is_image_space
 from stable_baselines3.common.torch_layers import FlattenExtractor
 from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback
-from stable_baselines3.common.vec_env import VecEnv
+from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv
 from stable_baselines3.sac.policies import LOG_STD_MAX, LOG_STD_MIN, SACPolicy
 from torch import nn
 
 from sb3_ctco.common.buffers import OptionReplayBuffer
-from sb3_ctco.common.callbacks import as_callback, in_primitive_steps
+from sb3_ctco.common.callbacks import as_callback, eval_callbacks, in_primitive_steps, wrap_each
+from sb3_ctco.common.load_arguments import check_load_arguments
+from sb3_ctco.option_array import OptionArray, plain
 from sb3_ctco.options import OptionSpace, check_seconds, discount, discount_rate_from_gamma, step_weight
 from sb3_ctco.wrappers import OptionExecutionWrapper, RewardRateWrapper
+
+SelfFixedRateSAC = TypeVar("SelfFixedRateSAC", bound="FixedRateSAC")
 
 
 class FixedDurationWrapper(gym.ActionWrapper, RecordConstructorArgs):
@@ -41,7 +47,7 @@ class FixedDurationWrapper(gym.ActionWrapper, RecordConstructorArgs):
 
     def action(self, action: np.ndarray) -> np.ndarray:
         """The option of these weights."""
-        return np.append(action, 1.0)
+        return np.append(plain(action), 1.0)
 
     def plan(self, action: np.ndarray) -> np.ndarray:
         """The primitive actions that it plays, ``[n_steps, *action_shape]``."""
@@ -63,6 +69,7 @@ class QuickSACPolicy(SACPolicy):
         super().__init__(*args, **kwargs)
         space, activation, extractor = self.observation_space, self.activation_fn, type(self.actor.features_extractor)
         is_vector = isinstance(space, spaces.Box) and not is_image_space(space) and extractor is FlattenExtractor
+        self._observation_shape: tuple[int, ...] = space.shape or ()
         if self.actor.use_sde or activation is not nn.ReLU or not is_vector:
             raise ValueError(
                 f"QuickSACPolicy is for vectors, ReLU and no gSDE, not for {extractor.__name__}, {activation.__name__}, "
@@ -80,7 +87,12 @@ class QuickSACPolicy(SACPolicy):
         deterministic: bool = False,
     ) -> tuple[np.ndarray, tuple[np.ndarray, ...] | None]:
         """Stable-Baselines3's ``predict``."""
-        assert isinstance(observation, np.ndarray)
+        n_axes = len(self._observation_shape)
+        if (
+            not isinstance(observation, np.ndarray)
+            or observation.shape[observation.ndim - n_axes :] != self._observation_shape
+        ):
+            return super().predict(observation, state, episode_start, deterministic)  # which says what is wrong with it
         x = observation.reshape(-1, self.actor.features_dim).astype(np.float32)
         layers: Any = self.actor.latent_pi
         for layer in layers[0::2]:
@@ -90,7 +102,7 @@ class QuickSACPolicy(SACPolicy):
             log_std = _affine(self.actor.log_std, x).clip(LOG_STD_MIN, LOG_STD_MAX)
             gaussian += np.exp(log_std) * th.randn(gaussian.shape).numpy()
         actions = self.unscale_action(np.tanh(gaussian))
-        return actions if observation.ndim > len(self.observation_space.shape) else actions[0], state  # type: ignore[arg-type]
+        return actions if observation.ndim > n_axes else actions[0], state
 
 
 def _affine(layer: Any, x: np.ndarray) -> np.ndarray:
@@ -163,11 +175,58 @@ class FixedRateSAC(SAC):
                 raise ValueError(f"the environment is another one than this model learned in: it has {found}")
         return space, scale
 
+    @classmethod
+    def load(  # type: ignore[override]
+        cls: type[SelfFixedRateSAC],
+        path: str | pathlib.Path | io.BufferedIOBase,
+        env: GymEnv | None = None,
+        device: th.device | str = "auto",
+        custom_objects: dict[str, Any] | None = None,
+        print_system_info: bool = False,
+        force_reset: bool = True,
+        **kwargs: Any,
+    ) -> SelfFixedRateSAC:
+        """Stable-Baselines3's ``load``; a bare environment is wrapped as the model's own was.
+
+        :param kwargs: SAC's arguments to change, but for those that follow from the clock
+        :raises ValueError: if the environment counts time or rewards otherwise
+        """
+        kwargs = check_load_arguments(cls, path, kwargs, ("gamma", "train_freq", "gradient_steps", "replay_buffer_class"))
+        if env is not None:
+            kwargs["n_envs"] = env.num_envs if isinstance(env, VecEnv) else 1
+        model = super().load(path, None, device, custom_objects, print_system_info, force_reset, **kwargs)
+        if env is not None:
+            model.set_env(env, force_reset)
+            if model.seed is not None:
+                model.env.seed(model.seed)  # type: ignore[union-attr]
+        return model
+
     def _init_callback(self, callback: MaybeCallback, progress_bar: bool = False) -> BaseCallback:
         self._n_seen = self.num_timesteps
         if self.updates_per_step is None:
             return super()._init_callback(callback, progress_bar)
-        return super()._init_callback(in_primitive_steps(as_callback(callback), progress_bar))
+        callback = as_callback(callback)
+        for evaluating in eval_callbacks(callback):
+            env = evaluating.eval_env
+            if type(env) is DummyVecEnv and not env.has_attr("option_space"):
+                evaluating.eval_env = wrap_each(env, self.wrap_env)
+            self._clock_of(evaluating.eval_env)
+        return super()._init_callback(in_primitive_steps(callback, progress_bar))
+
+    def _update_current_progress_remaining(self, num_timesteps: int, total_timesteps: int) -> None:
+        # The last decision may end after the last step that was asked for: schedules are of numbers from 1 to 0.
+        super()._update_current_progress_remaining(min(num_timesteps, total_timesteps), total_timesteps)
+
+    def predict(
+        self,
+        observation: np.ndarray | dict[str, np.ndarray],
+        state: tuple[np.ndarray, ...] | None = None,
+        episode_start: np.ndarray | None = None,
+        deterministic: bool = False,
+    ) -> tuple[np.ndarray, tuple[np.ndarray, ...] | None]:
+        """Stable-Baselines3's ``predict``; with ``hold_seconds`` for an environment wrapped as by :meth:`wrap_env`."""
+        actions, state = super().predict(observation, state, episode_start, deterministic)
+        return actions if self.updates_per_step is None else actions.view(OptionArray), state
 
     def train(self, gradient_steps: int, batch_size: int = 64) -> None:
         """SAC's; where decisions take several steps, the updates that are due."""
@@ -341,8 +400,15 @@ def _priced_buffer(
             f"hold_seconds is for observations in one array, not in {env.observation_space}: flatten them with "
             "gymnasium.wrappers.FlattenObservation"
         )
+    buffer_kwargs = given.get("replay_buffer_kwargs") or {}
+    for name in ("discount_rate", "reward_scale", "decision_price"):
+        if name in buffer_kwargs:
+            raise TypeError(
+                f"with hold_seconds sac_at_rate sets the replay buffer's {name} itself, not to {buffer_kwargs[name]}: leave "
+                "it out of replay_buffer_kwargs"
+            )
     kwargs = {
-        **(given.get("replay_buffer_kwargs") or {}),
+        **buffer_kwargs,
         "discount_rate": discount_rate,
         "reward_scale": reward_scale,
         "decision_price": decision_price * reward_scale,
@@ -355,6 +421,8 @@ def _explore_with_pink_noise(model: FixedRateSAC, n_decisions: int) -> None:
         from pink import PinkNoiseDist
     except ImportError as error:
         raise ImportError("pink_noise_seconds needs the package pink-noise-rl: run pip install pink-noise-rl") from error
+    if isinstance(model.policy, QuickSACPolicy):
+        raise ValueError("QuickSACPolicy draws white noise, whatever pink_noise_seconds says: use policy='MlpPolicy'")
     (action_dim,) = model.action_space.shape  # type: ignore[misc]
     model.pink_noise = PinkNoiseDist(n_decisions, action_dim, rng=np.random.default_rng(model.seed))
     model.actor.action_dist = model.pink_noise

@@ -577,3 +577,29 @@ def test_dac_ppo_learns_pendulum():
     env.seed(1000)
     mean_return, _ = evaluate_policy(model, env, n_eval_episodes=40)
     assert mean_return > -600
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"gamma": 1.5}, "gamma must be in"),
+        ({"gae_lambda": 2.0}, "gae_lambda must be in"),
+        ({"n_epochs": 0}, "n_epochs must be at least 1"),
+        ({"updates_per_second": -1.0}, "updates_per_second must be positive"),
+    ],
+)
+def test_load_refuses_what_the_constructor_does(scripted_env, tmp_path, change, message):
+    make(scripted_env(), n_epochs=3).save(tmp_path / "model")
+    with pytest.raises(ValueError, match=message):
+        DACPPO.load(tmp_path / "model", **change)
+
+
+def test_how_often_to_update_may_be_changed_while_loading(scripted_env, tmp_path):
+    make(scripted_env(), n_epochs=None, updates_per_second=10.0).save(tmp_path / "model")
+    loaded = DACPPO.load(tmp_path / "model", updates_per_second=None)
+    assert (loaded.n_epochs, loaded.updates_per_second) == (5, None)
+    loaded = DACPPO.load(tmp_path / "model", n_epochs=2)
+    assert (loaded.n_epochs, loaded.updates_per_second) == (2, None)
+    loaded.save(tmp_path / "model")
+    loaded = DACPPO.load(tmp_path / "model", updates_per_second=4.0)
+    assert (loaded.n_epochs, loaded.updates_per_second) == (None, 4.0)

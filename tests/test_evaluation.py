@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from gymnasium import spaces
 from stable_baselines3 import SAC
+from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
@@ -254,3 +255,33 @@ def test_the_smoothness_of_rewards_as_rates():
     env = RewardRateWrapper(CountingEnv(), discount_rate=TAU)
     (episode,) = evaluate_discounted_return(Scripted([0.0], [4.0]), env, 1, smoothness=True)
     assert episode.largest_jump == 2.0  # through the whole of [−1, 1]
+
+
+@pytest.mark.parametrize("algorithm", ["ctco", "sac"])
+def test_an_episode_that_a_training_was_stopped_in_is_recorded_whole_or_not_at_all(algorithm):
+    """Episodes of ten steps; a training of 15, then one that goes on in the middle of the second episode."""
+
+    def make_model():
+        kwargs = {"learning_starts": 1000, "buffer_size": 100}
+        if algorithm == "sac":
+            return SAC("MlpPolicy", RewardRateWrapper(Monitor(CountingEnv())), **kwargs)
+        return CTCO("MlpPolicy", CountingEnv(), d_min=0.1, d_max=0.1, n_sub_options=0, **kwargs)
+
+    whole = DiscountedReturnCallback()
+    make_model().learn(40, whole)
+    assert len(whole.episodes) == 4
+    # The same callback sees both parts of the second episode.
+    callback = DiscountedReturnCallback()
+    model = make_model().learn(15, callback)
+    model.learn(25, callback, reset_num_timesteps=False)
+    assert [vars(one) for one in callback.episodes] == [pytest.approx(vars(one), nan_ok=True) for one in whole.episodes]
+    # Another one sees the end of it alone, which is no episode.
+    model = make_model().learn(15)
+    other = DiscountedReturnCallback()
+    model.learn(25, other, reset_num_timesteps=False)
+    assert [vars(one) for one in other.episodes] == [pytest.approx(vars(one), nan_ok=True) for one in whole.episodes[2:]]
+    # And one that saw the beginning of an episode that was broken off.
+    model = make_model().learn(15, callback := DiscountedReturnCallback())
+    model._last_obs = None  # as after an error: the next training begins with a reset
+    model.learn(25, callback, reset_num_timesteps=False)
+    assert [episode.seconds for episode in callback.episodes] == pytest.approx([1.0, 1.0])

@@ -11,8 +11,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 from stable_baselines3 import SAC
 from stable_baselines3.common.buffers import ReplayBuffer
-from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.callbacks import BaseCallback, EvalCallback
 from stable_baselines3.common.env_util import make_vec_env
+from stable_baselines3.common.evaluation import evaluate_policy
 from stable_baselines3.common.monitor import Monitor
 
 from sb3_ctco import OptionExecutionWrapper, RewardRateWrapper, sac_at_rate
@@ -457,3 +458,65 @@ def test_what_holding_actions_does_with_the_replay_buffers_arguments(scripted_en
         sac_at_rate(scripted_env(), 0.1, hold_seconds=0.2, replay_buffer_class=ReplayBuffer, **SMALL)
     with pytest.raises(ValueError, match=r"in one array, not in Dict.*FlattenObservation"):
         sac_at_rate(random_walk_env("dict"), 0.1, policy="MultiInputPolicy", hold_seconds=0.2, **SMALL)
+
+
+# --- decisions of several steps among Stable-Baselines3's callbacks, files and predictions
+
+
+def test_a_held_sac_is_evaluated_in_its_own_time(scripted_env):
+    """A bare environment of an EvalCallback is wrapped, and a held action sent to a bare one is an error."""
+    held = {"hold_seconds": 0.5, "learning_starts_seconds": 100.0}
+    model = sac_at_rate(scripted_env(dt=0.1, truncate_at=20), 0.1, **held, **SMALL)
+    bare, played = scripted_env(dt=0.1, truncate_at=20), []
+    step = bare.step
+    bare.step = lambda action: played.append(float(action[0])) or step(action)
+    model.learn(20, EvalCallback(Monitor(bare), n_eval_episodes=1, eval_freq=20, verbose=0))
+    assert len(played) == 20
+    assert played == [action for action in played[::5] for _ in range(5)]
+    model = sac_at_rate("Pendulum-v1", 0.05, hold_seconds=0.2, **SMALL)
+    with pytest.raises(TypeError, match="bare environment"):
+        evaluate_policy(model, Monitor(gym.make("Pendulum-v1")), 1)
+    other = hold_actions(gym.make("Pendulum-v1"), 0.5, 1, False, 0.05, DEFAULT_DISCOUNT_RATE)
+    with pytest.raises(ValueError, match=r"d_max=0\.5 in place of 0\.2"):
+        model.learn(20, EvalCallback(other, verbose=0))
+
+
+@pytest.mark.parametrize("held", [{}, {"hold_seconds": 0.5}, {"hold_seconds": 0.5, "learned_duration": True}])
+def test_a_bare_environment_is_wrapped_while_loading(scripted_env, tmp_path, held):
+    model = sac_at_rate(scripted_env(dt=0.1), 0.1, learning_starts_seconds=100.0, **held, **SMALL).learn(20)
+    model.save(tmp_path / "model")
+    loaded = FixedRateSAC.load(tmp_path / "model", env=scripted_env(dt=0.1), device="cpu")
+    assert loaded.get_env().get_attr("option_space") == model.get_env().get_attr("option_space")
+    assert 40 <= loaded.learn(20, reset_num_timesteps=False).num_timesteps < 50
+    with pytest.raises(ValueError, match=r"'gamma': 0\.5.* cannot be changed while loading"):
+        FixedRateSAC.load(tmp_path / "model", gamma=0.5)
+
+
+def test_what_the_clock_says_of_the_buffer_is_not_given_twice(scripted_env):
+    with pytest.raises(TypeError, match=r"sets the replay buffer's reward_scale itself, not to 0\.1"):
+        sac_at_rate(scripted_env(), 0.1, hold_seconds=0.5, replay_buffer_kwargs={"reward_scale": 0.1})
+
+
+def test_quick_decisions_are_those_of_white_noise_and_of_right_observations(scripted_env):
+    quick = {"policy": QuickSACPolicy, **SMALL}
+    with pytest.raises(ValueError, match="QuickSACPolicy draws white noise"):
+        sac_at_rate(scripted_env(), 0.1, pink_noise_seconds=1.0, **quick)
+    model = sac_at_rate(scripted_env(), 0.1, **quick)
+    with pytest.raises(ValueError, match="Unexpected observation shape"):
+        model.predict(np.zeros(4, np.float32))
+    with pytest.raises(ValueError, match="tuple"):
+        model.predict((np.zeros(2, np.float32), {}))
+
+
+def test_progress_ends_at_zero_also_where_the_last_decision_ends_later(scripted_env):
+    seen = []
+    model = sac_at_rate(
+        scripted_env(dt=0.1),
+        0.1,
+        learning_starts_seconds=0.5,
+        hold_seconds=0.5,
+        learning_rate=lambda remaining: seen.append(remaining) or 1e-3,
+        **SMALL,
+    )
+    assert model.learn(22).num_timesteps == 25
+    assert min(seen) == 0.0

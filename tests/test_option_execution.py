@@ -543,3 +543,65 @@ def test_options_mean_the_same_where_a_step_takes_longer_than_the_shortest(scrip
 def test_whole_numbers_are_no_continuous_actions(scripted_env):
     with pytest.raises(TypeError, match=r"actions that are real numbers, not Box\(-3, 3, \(1,\), int8\)"):
         OptionExecutionWrapper(scripted_env(action_space=spaces.Box(-3, 3, (1,), np.int8)))
+
+
+class Playing(gym.Env):
+    """Plays sequences itself, as quick environments do."""
+
+    dt = 0.1
+    observation_space = spaces.Box(-1e6, 1e6, (1,), np.float32)
+    action_space = spaces.Box(-1.0, 1.0, (1,), np.float32)
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        return np.zeros(1, np.float32), {}
+
+    def step(self, action):
+        return np.zeros(1, np.float32), 1.0, False, False, {}
+
+    def step_sequence(self, actions, observe=()):
+        return np.zeros(1, np.float32), [1.0] * len(actions), False, False, {"observations": [np.zeros(1)] * len(observe)}
+
+
+class Shaped(Playing):
+    def step(self, action):
+        obs, reward, *rest = super().step(action)
+        return obs, reward - 3.0, *rest
+
+
+class ShapedTogether(Shaped):
+    def step_sequence(self, actions, observe=()):
+        obs, rewards, *rest = super().step_sequence(actions, observe)
+        return obs, [reward - 5.0 for reward in rewards], *rest
+
+
+@pytest.mark.parametrize("n_sub_options", [0, 2])
+@pytest.mark.parametrize(("environment", "reward"), [(Playing, 1.0), (Shaped, -2.0), (ShapedTogether, -4.0)])
+def test_a_step_that_a_subclass_defines_is_not_passed_by(environment, reward, n_sub_options):
+    env = wrap(environment(), reward="sum", n_sub_options=n_sub_options)
+    env.reset(seed=0)
+    assert env.step([0.0, 1.0])[1] == pytest.approx(10 * reward)
+    replaced = environment()
+    step = replaced.step
+
+    def with_bonus(action):
+        obs, r, *rest = step(action)
+        return obs, r + 7.0, *rest
+
+    replaced.step = with_bonus
+    env = wrap(replaced, reward="sum")
+    env.reset(seed=0)
+    inner = -2.0 if environment is ShapedTogether else reward  # what its step says
+    assert env.step([0.0, 1.0])[1] == pytest.approx(10 * (inner + 7.0))
+
+
+def test_rewards_may_come_in_the_same_array_each_time(scripted_env):
+    paid = np.zeros(1)
+
+    def rewards(step, action):
+        paid[:] = step + 1
+        return paid
+
+    env = wrap(scripted_env(rewards=rewards), reward="sum")
+    env.reset(seed=0)
+    assert env.step([0.0, 1.0])[1] == 55.0

@@ -1,5 +1,6 @@
 """Somebody else acts for a while: what is sent, recorded and stored."""
 
+import gymnasium as gym
 import numpy as np
 import pytest
 
@@ -97,3 +98,23 @@ def test_with_a_continuous_join_control_comes_back_where_it_was_given(scripted_e
         assert info["option"]["n_steps"] == 4
     # A tenth of the way from −0.5 to 0.25 with each step
     np.testing.assert_allclose(env.plan([0.25, 1.0])[:2, 0], [-0.425, -0.35], atol=1e-6)
+
+
+def test_what_a_machine_says_was_sent_is_copied(scripted_env):
+    """It may say so in the same array each time."""
+
+    class Reporting(gym.Wrapper):
+        sent = np.zeros(1, np.float32)
+
+        def step(self, action):
+            self.sent[:] = action
+            *outcome, info = self.env.step(action)
+            return (*outcome, {**info, "last_action": self.sent})
+
+    recorded = []
+    env = TakeOverWrapper(Reporting(scripted_env()), lambda obs: [obs[0] / 10], recorded.append)
+    env.reset(seed=0)
+    for _ in range(4):
+        env.step(np.zeros(1, np.float32))
+    env.hand_over()
+    np.testing.assert_allclose(recorded[0].actions[:, 0], [0.0, 0.1, 0.2, 0.3], atol=1e-6)

@@ -1,5 +1,8 @@
 """Every number of steps that a user gives or sees counts primitive steps."""
 
+import itertools
+import math
+
 import gymnasium as gym
 import numpy as np
 import pytest
@@ -13,6 +16,8 @@ from stable_baselines3.common.callbacks import (
     StopTrainingOnMaxEpisodes,
 )
 from stable_baselines3.common.env_util import make_vec_env
+from stable_baselines3.common.evaluation import evaluate_policy
+from stable_baselines3.common.noise import NormalActionNoise
 
 from sb3_ctco import CTCO, OptionExecutionWrapper
 
@@ -258,3 +263,80 @@ def test_gymnasium_pendulum_through_the_string():
     model.learn(200)
     assert model.ep_info_buffer[0]["l"] == 200
     assert gym.make("Pendulum-v1").unwrapped.dt == model.dt
+
+
+def test_a_rollout_begins_and_ends_once_a_training(random_walk_env):
+    """With ``train_freq=50`` four times in 200 steps, as SAC's, however many decisions these take."""
+
+    class Rollouts(Recorder):
+        def __init__(self):
+            super().__init__()
+            self.events = []
+
+        def _on_rollout_start(self):
+            self.events.append(("start", self.model._n_updates))
+
+        def _on_rollout_end(self):
+            self.events.append(("end", self.num_timesteps))
+
+    callback = Rollouts()
+    model = make(random_walk_env(), train_freq=50, gradient_steps=1, learning_starts=0).learn(200, callback)
+    starts, ends = ([at for event, at in callback.events if event == name] for name in ("start", "end"))
+    assert starts == list(range(model._n_updates))  # each before updates are made
+    assert len(ends) == len(starts) == len(callback.events) // 2 == 4
+    assert all(end - begin >= 50 for begin, end in itertools.pairwise([0, *ends]))
+
+
+@pytest.mark.parametrize("train_freq", [0, -3])
+def test_a_train_freq_that_is_none(random_walk_env, train_freq):
+    with pytest.raises(ValueError, match=f"train_freq must be at least 1, not {train_freq}"):
+        make(random_walk_env(), train_freq=train_freq)
+
+
+def test_schedules_are_of_numbers_from_one_to_zero(random_walk_env):
+    """A root of the remaining progress is real, also for updates after an option that ends beyond the last step."""
+    seen = []
+    model = make(
+        random_walk_env(),
+        d_min=0.6,
+        learning_starts=10,
+        learning_rate=lambda remaining: seen.append(remaining) or 1e-3 * math.sqrt(remaining),
+    ).learn(102)
+    assert model.num_timesteps == 106  # episodes of 20 steps, options of 6 and at last 2
+    assert (min(seen), max(seen)) == (0.0, 1.0)
+
+
+def test_noise_is_of_options(random_walk_env):
+    noise = NormalActionNoise(np.zeros(1), np.ones(1))
+    with pytest.raises(ValueError, match=r"action_noise has the shape \(1,\): it is added to options, \(4,\) numbers"):
+        make(random_walk_env(), action_noise=noise).learn(20)
+    make(random_walk_env(), action_noise=NormalActionNoise(np.zeros(4), np.ones(4))).learn(20)
+
+
+def test_learning_goes_on_after_somebody_else_used_the_environment(random_walk_env):
+    """To evaluate in the model's own environment moves it on, so the next training begins with a reset."""
+    model = make(random_walk_env(), n_sub_options=4, buffer_size=1000).learn(30)
+    env = model.get_env()
+    resets = []
+    reset = env.reset
+    env.reset = lambda: resets.append(1) or reset()
+    model.learn(30, reset_num_timesteps=False)
+    assert not resets
+    evaluate_policy(model, env, 1)
+    resets.clear()
+    model.learn(30, reset_num_timesteps=False)
+    assert len(resets) == 1
+    rows = model.replay_buffer.observations[: model.replay_buffer.pos, 0], model.replay_buffer.durations[:, 0]
+    following = model.replay_buffer.next_observations[: model.replay_buffer.pos, 0]
+    # The second number counts steps: an option ends as many later as it took, wherever it began.
+    np.testing.assert_allclose(following[:, 1] - rows[0][:, 1], rows[1][: len(following)] / 2.0, atol=1e-6)
+
+
+def test_two_models_in_turn_in_one_environment(random_walk_env):
+    """Each has its sub-options."""
+    env = make_vec_env(random_walk_env, wrapper_class=OptionExecutionWrapper, wrapper_kwargs={"d_max": 0.6}, seed=0)
+    first, second = make(env, n_sub_options=4), make(env)
+    for model in (first, second, first):
+        model.learn(60, reset_num_timesteps=False)
+    assert first.replay_buffer.size() > first.replay_buffer.n_decisions
+    assert second.replay_buffer.size() == second.replay_buffer.n_decisions

@@ -104,6 +104,8 @@ class OptionExecutionWrapper(gym.Wrapper, RecordConstructorArgs):
 
     #: Whether ``dt`` was given and is another than what the environment tells of itself
     overrides_dt = False
+    #: Calls of ``reset`` and ``step``: more of them tell a model that somebody else used its environment
+    n_calls = 0
 
     def __init__(
         self,
@@ -206,6 +208,7 @@ class OptionExecutionWrapper(gym.Wrapper, RecordConstructorArgs):
         :raises TypeError: if the environment does not return an observation and an info
         :raises ValueError: if the observation is not finite, or not as its space says
         """
+        self.n_calls += 1
         self._play = None
         result = reset_env(self.env, seed, options)
         if seed is not None:
@@ -243,6 +246,7 @@ class OptionExecutionWrapper(gym.Wrapper, RecordConstructorArgs):
         :raises ValueError: if the option has another shape or is not finite, or if the environment returned a reward
             or an observation that is not finite or has another shape
         """
+        self.n_calls += 1
         given = np.asarray(plain(action), dtype=np.float64)
         option = given.ravel()
         if option.shape != self.action_space.shape:
@@ -358,7 +362,8 @@ class OptionExecutionWrapper(gym.Wrapper, RecordConstructorArgs):
         for first, last in itertools.pairwise((0, *observe, len(actions))):
             for action in actions[first:last]:
                 obs, reward, terminated, truncated, info = step(action)
-                rewards.append(reward)  # type: ignore[arg-type]
+                # A copy, as an environment may return the same array once more.
+                rewards.append(reward.copy() if isinstance(reward, np.ndarray) else reward)  # type: ignore[arg-type]
                 if joined and LAST_ACTION in info:
                     sent[len(rewards) - 1] = info[LAST_ACTION]
                 # What was sent in place of an action ends its option, as the end of an episode does.

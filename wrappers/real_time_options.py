@@ -238,7 +238,7 @@ class RealTimeOptionWrapper(OptionExecutionWrapper):
                 raise ResetNeeded("playing was abandoned: call reset() first")
             self._commands.append(action)
             obs, reward, terminated, truncated, info = self.env.step(action)
-            rewards.append(reward)
+            rewards.append(deepcopy(reward))
             self._sent.append(np.array(info.get(LAST_ACTION, action), np.float64))
             if self.n_sub_options:
                 # All of them, because those of a rest are chosen after it.

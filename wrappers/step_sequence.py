@@ -39,7 +39,7 @@ def find_step_sequence(env: gym.Env, observing: bool) -> StepSequence | None:
     :param observing: whether it must be able to observe on the way
     """
     if isinstance(env, SupportsStepSequence):
-        able = not observing or "observe" in inspect.signature(env.step_sequence).parameters
+        able = _says_the_same(env) and (not observing or "observe" in inspect.signature(env.step_sequence).parameters)
         return env.step_sequence if able else None
     # Exact types: a subclass may look at every step.
     if type(env) in (OrderEnforcing, PassiveEnvChecker):
@@ -48,6 +48,13 @@ def find_step_sequence(env: gym.Env, observing: bool) -> StepSequence | None:
         inner = find_step_sequence(env.env, observing)
         return None if inner is None else partial(_play_monitored, env, inner)
     return None
+
+
+def _says_the_same(env: gym.Env) -> bool:
+    """Whether ``step_sequence`` knows of the ``step`` that is called: no subclass put another one in its place."""
+    definers = [vars(env), *map(vars, type(env).__mro__)]
+    first = {name: next((i for i, names in enumerate(definers) if name in names), 0) for name in ("step", "step_sequence")}
+    return first["step_sequence"] <= first["step"]
 
 
 def _play_monitored(monitor: Monitor, play: StepSequence, actions: np.ndarray, *observe: Sequence[int]) -> SequenceResult:

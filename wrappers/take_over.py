@@ -62,7 +62,7 @@ class TakeOverWrapper(gym.Wrapper, RecordConstructorArgs):
             self._observations = self._observations or [self._last_obs]
             self._observations.append(deepcopy(obs))
             # A guard inside may have sent another one.
-            self._actions.append(info.get(LAST_ACTION, other))
+            self._actions.append(np.array(info.get(LAST_ACTION, other)))
             self._rewards.append(float(reward))
             # Whatever is inside, such as a guard, knows better what was sent.
             info = {LAST_ACTION: other, **info, TAKEN_OVER: True}

@@ -1,9 +1,10 @@
 """Time accounting: callbacks that see primitive steps while the algorithm takes decisions."""
 
 from collections import deque
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from typing import Any
 
+import gymnasium as gym
 import numpy as np
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.callbacks import (
@@ -15,6 +16,7 @@ from stable_baselines3.common.callbacks import (
     ProgressBarCallback,
 )
 from stable_baselines3.common.type_aliases import MaybeCallback
+from stable_baselines3.common.vec_env import DummyVecEnv
 
 from sb3_ctco.options import PENDING
 
@@ -28,6 +30,14 @@ def eval_callbacks(callback: BaseCallback | None) -> Iterator[EvalCallback]:
         yield from eval_callbacks(child)
 
 
+def wrap_each(env: DummyVecEnv, wrap: Callable[[gym.Env], gym.Env]) -> DummyVecEnv:
+    """An EvalCallback's environments, which it was given bare, wrapped; with the seed that they were given."""
+    wrapped = DummyVecEnv([lambda inner=inner: wrap(inner) for inner in env.envs])  # type: ignore[misc]
+    if env._seeds[0] is not None:
+        wrapped.seed(env._seeds[0])
+    return wrapped
+
+
 def as_callback(callback: MaybeCallback) -> BaseCallback | None:
     """What ``learn`` accepts as one callback: a list of them, or a function, as Stable-Baselines3 takes it."""
     if isinstance(callback, list):
@@ -38,6 +48,28 @@ def as_callback(callback: MaybeCallback) -> BaseCallback | None:
 def in_primitive_steps(callback: BaseCallback | None, progress_bar: bool) -> CallbackList:
     """A user's callback that sees primitive steps, and the progress bar that does."""
     return CallbackList([PrimitiveStepCallback(callback), *([OptionProgressBarCallback()] if progress_bar else [])])
+
+
+class WithinRollout(BaseCallback):
+    """What a rollout of several pieces shows its callback of each: the steps, and not where a piece begins and ends.
+
+    :param callback: that of the whole rollout
+    """
+
+    def __init__(self, callback: BaseCallback):
+        super().__init__()
+        self.callback = callback
+
+    def update_locals(self, locals_: dict[str, Any]) -> None:
+        """Hand on the locals of the piece."""
+        self.callback.update_locals(locals_)
+
+    def on_step(self) -> bool:
+        """Hand on the step."""
+        return self.callback.on_step()
+
+    def _on_step(self) -> bool:
+        return True
 
 
 class PrimitiveStepCallback(BaseCallback):

@@ -43,7 +43,7 @@ from stable_baselines3.common.vec_env import (
 )
 
 from sb3_ctco.common.buffers import DictOptionReplayBuffer, OptionReplayBuffer
-from sb3_ctco.common.callbacks import as_callback, eval_callbacks, in_primitive_steps
+from sb3_ctco.common.callbacks import WithinRollout, as_callback, eval_callbacks, in_primitive_steps, wrap_each
 from sb3_ctco.common.load_arguments import check_load_arguments
 from sb3_ctco.option_array import OptionArray
 from sb3_ctco.options import (
@@ -157,6 +157,8 @@ class OptionOffPolicyAlgorithm(OffPolicyAlgorithm):
         self.primitive_action_space: spaces.Box | None = None
         self.reward_unit: RewardUnit | None = None
         self._updates_due = 0.0
+        #: How often the environments had been called when learning ended
+        self._env_calls: list[int] | None = None
 
         if env is not None:
             env = self._as_option_env(maybe_make_env(env, verbose))
@@ -243,9 +245,7 @@ class OptionOffPolicyAlgorithm(OffPolicyAlgorithm):
                     "model.wrap_env(env), or make it with make_vec_env(..., wrapper_class=OptionExecutionWrapper, "
                     "wrapper_kwargs=dict(n_rbf=..., d_max=...))"
                 )
-            bare, env = env, DummyVecEnv([lambda inner=inner: self.wrap_env(inner) for inner in env.envs])  # type: ignore[misc]
-            if bare._seeds[0] is not None:
-                env.seed(bare._seeds[0])
+            env = wrap_each(env, self.wrap_env)
         _warn_of_outer_monitors(env)
         self._check_settings(env)
         return env
@@ -291,9 +291,10 @@ class OptionOffPolicyAlgorithm(OffPolicyAlgorithm):
         expected = OptionSpace.make(**{**known, "d_min": known["d_min"] or known["dt"]})
         for one in settings:
             for name, (value, found) in expected.differences(one).items():
+                hint = f", or pass dt={found} to load, where options last as long at another rate" if name == "dt" else ""
                 raise ValueError(
                     f"the environment's options have {name}={found}, {type(self).__name__} has "
-                    f"{name}={value}: give both the same (discount_rate is -ln(gamma)/gamma_dt)"
+                    f"{name}={value}: give both the same (discount_rate is -ln(gamma)/gamma_dt){hint}"
                 )
         units: list[RewardUnit] = env.get_attr("reward_unit")
         for unit in units:
@@ -423,6 +424,8 @@ class OptionOffPolicyAlgorithm(OffPolicyAlgorithm):
             space = self._check_env(self.env)
             self.dt, self.d_min = space.dt, space.d_min
         super()._setup_model()
+        if self.train_freq.frequency < 1:  # type: ignore[union-attr]
+            raise ValueError(f"train_freq must be at least 1, not {self.train_freq.frequency}")  # type: ignore[union-attr]
         if self.env is None:
             self._tell_buffer()
         else:
@@ -523,7 +526,36 @@ class OptionOffPolicyAlgorithm(OffPolicyAlgorithm):
         Parameters are those of Stable-Baselines3's ``learn``; ``tb_log_name`` is the class's name by default.
         """
         name = type(self).__name__ if tb_log_name is None else tb_log_name
-        return super().learn(total_timesteps, callback, log_interval, name, reset_num_timesteps, progress_bar)
+        if self.env is not None and self._was_moved(self.env):
+            self._last_obs = None  # begin with a reset
+        model = super().learn(total_timesteps, callback, log_interval, name, reset_num_timesteps, progress_bar)
+        self._env_calls = self.env.get_attr("n_calls")  # type: ignore[union-attr]
+        return model
+
+    def _was_moved(self, env: VecEnv) -> bool:
+        """Whether somebody else used the environment since it was learned in, to evaluate, or to learn with another model."""
+        if any(n != self.n_sub_options for n in env.get_attr("n_sub_options")):
+            env.env_method("set_n_sub_options", self.n_sub_options)
+            return True
+        return env.get_attr("n_calls") != self._env_calls
+
+    def _update_current_progress_remaining(self, num_timesteps: int, total_timesteps: int) -> None:
+        # The last option may end after the last step that was asked for: schedules are of numbers from 1 to 0.
+        super()._update_current_progress_remaining(min(num_timesteps, total_timesteps), total_timesteps)
+
+    def _sample_action(
+        self, learning_starts: int, action_noise: ActionNoise | None = None, n_envs: int = 1
+    ) -> tuple[np.ndarray, np.ndarray]:
+        noise: Any = None if action_noise is None else lambda: self._noise_of_options(action_noise())
+        return super()._sample_action(learning_starts, noise, n_envs)
+
+    def _noise_of_options(self, noise: np.ndarray) -> np.ndarray:
+        if np.shape(noise)[-1:] != self.action_space.shape:
+            raise ValueError(
+                f"action_noise has the shape {np.shape(noise)}: it is added to options, {self.action_space.shape} numbers (ω, "
+                "then d), and not to actions"
+            )
+        return noise
 
     def collect_rollouts(
         self,
@@ -542,10 +574,12 @@ class OptionOffPolicyAlgorithm(OffPolicyAlgorithm):
         start = self.num_timesteps
         by_step = train_freq.unit == TrainFrequencyUnit.STEP
         chunk = TrainFreq(1, TrainFrequencyUnit.STEP) if by_step else train_freq
+        callback.on_rollout_start()
+        within = WithinRollout(callback)
         while True:
             try:
                 rollout = super().collect_rollouts(
-                    env, callback, chunk, replay_buffer, action_noise, learning_starts, log_interval
+                    env, within, chunk, replay_buffer, action_noise, learning_starts, log_interval
                 )
             except BaseException:
                 # The environment may have moved on without its transition being stored: begin with a reset.
@@ -555,6 +589,7 @@ class OptionOffPolicyAlgorithm(OffPolicyAlgorithm):
                 self._last_obs = None
                 break
             if not by_step or self.num_timesteps - start >= train_freq.frequency * self.n_envs:
+                callback.on_rollout_end()
                 break
         steps = self.num_timesteps - start
         if self.updates_per_second is not None:

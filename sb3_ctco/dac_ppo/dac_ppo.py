@@ -142,24 +142,8 @@ class DACPPO(OnPolicyAlgorithm):
             _init_setup_model=False,
             supported_action_spaces=(spaces.Box,),
         )
-        if n_epochs is not None and updates_per_second is not None:
-            raise ValueError(
-                f"n_epochs={n_epochs} and updates_per_second={updates_per_second} both say how often to update: "
-                "pass one of them"
-            )
-        if updates_per_second is not None and not 0 < updates_per_second < np.inf:
-            raise ValueError(f"updates_per_second must be positive or None, not {updates_per_second}")
-        if n_epochs is not None and n_epochs < 1:
-            raise ValueError(f"n_epochs must be at least 1, not {n_epochs}")
-        if batch_size < 2 and normalize_advantage:
-            raise ValueError(f"batch_size must be at least 2 to normalise advantages, not {batch_size}")
-        if not 0.0 <= gae_lambda <= 1.0:
-            raise ValueError(f"gae_lambda must be in [0, 1], not {gae_lambda}")
-        # With one step as the unit of time γ is the discount of a step, so this checks its range as well.
-        discount_rate_from_gamma(gamma, 1.0 if gamma_dt is None else gamma_dt)
-        check_seconds(dt=dt)
         self.batch_size = batch_size
-        self.n_epochs = 5 if n_epochs is None and updates_per_second is None else n_epochs
+        self.n_epochs = n_epochs
         self.updates_per_second = updates_per_second
         self.gamma_dt = gamma_dt
         self.dt = dt
@@ -175,6 +159,7 @@ class DACPPO(OnPolicyAlgorithm):
     def _setup_model(self) -> None:
         if not np.issubdtype(self.action_space.dtype, np.floating):  # type: ignore[arg-type]
             raise TypeError(f"DACPPO needs actions that are real numbers, not {self.action_space}, which it would round")
+        self._check_arguments()
         if self.env is not None:
             self._check_env(self.env)
         if self.rollout_buffer_class is None:
@@ -190,6 +175,26 @@ class DACPPO(OnPolicyAlgorithm):
         # As in Stable-Baselines3's PPO: a function of the remaining progress, whatever was given.
         self.clip_range = FloatSchedule(self.clip_range)
         self._last_options = np.zeros(self.n_envs, dtype=np.int64)
+
+    def _check_arguments(self) -> None:
+        if self.n_epochs is not None and self.updates_per_second is not None:
+            raise ValueError(
+                f"n_epochs={self.n_epochs} and updates_per_second={self.updates_per_second} both say how often to update: "
+                "pass one of them"
+            )
+        if self.updates_per_second is not None and not 0 < self.updates_per_second < np.inf:
+            raise ValueError(f"updates_per_second must be positive or None, not {self.updates_per_second}")
+        if self.n_epochs is None and self.updates_per_second is None:
+            self.n_epochs = 5
+        if self.n_epochs is not None and self.n_epochs < 1:
+            raise ValueError(f"n_epochs must be at least 1, not {self.n_epochs}")
+        if self.batch_size < 2 and self.normalize_advantage:
+            raise ValueError(f"batch_size must be at least 2 to normalise advantages, not {self.batch_size}")
+        if not 0.0 <= self.gae_lambda <= 1.0:
+            raise ValueError(f"gae_lambda must be in [0, 1], not {self.gae_lambda}")
+        # With one step as the unit of time γ is the discount of a step, so this checks its range as well.
+        discount_rate_from_gamma(self.gamma, 1.0 if self.gamma_dt is None else self.gamma_dt)
+        check_seconds(dt=self.dt)
 
     def _check_env(self, env: VecEnv) -> None:
         """Find the environment's dt, or see that it is the algorithm's.
@@ -246,6 +251,8 @@ class DACPPO(OnPolicyAlgorithm):
         # Of two that say the same in different ways, the one that is given holds.
         if "n_epochs" in kwargs:
             kwargs.setdefault("updates_per_second", None)
+        elif kwargs.get("updates_per_second") is not None:
+            kwargs["n_epochs"] = None
         return super().load(path, env, device, custom_objects, print_system_info, force_reset, **kwargs)
 
     def _a_step(self, factor: float) -> float:
