@@ -29,9 +29,6 @@ from sb3_ctco.wrappers import find_dt
 mpl.use("Agg")
 from matplotlib import pyplot as plt
 
-GAMMA, GAMMA_DT = 0.98, 0.05
-DISCOUNT_RATE = discount_rate_from_gamma(GAMMA, GAMMA_DT)
-
 
 @dataclass
 class Run:
@@ -58,17 +55,19 @@ def train(name: str, args: argparse.Namespace, seed: int) -> Run:
         "seed": seed,
         "device": "cpu",
     }
+    gamma_dt = args.gamma_dt or dt
+    discount_rate = discount_rate_from_gamma(args.gamma, gamma_dt)
     model: OffPolicyAlgorithm
     if name == "SAC":
-        model = SAC("MlpPolicy", env, gamma=math.exp(-DISCOUNT_RATE * dt), **common)
+        model = SAC("MlpPolicy", env, gamma=math.exp(-discount_rate * dt), **common)
     else:
-        model = CTCO("MlpPolicy", env, gamma=GAMMA, gamma_dt=GAMMA_DT, d_max=args.d_max, **common)
-    callback = DiscountedReturnCallback(DISCOUNT_RATE, dt)
+        model = CTCO("MlpPolicy", env, gamma=args.gamma, gamma_dt=gamma_dt, d_max=args.d_max, **common)
+    callback = DiscountedReturnCallback(discount_rate, dt)
     start = time.time()
     model.learn(args.steps, callback, progress_bar=args.progress)
     wall_seconds = time.time() - start
     greedy = evaluate_discounted_return(
-        model, model.get_env(), args.eval_episodes, discount_rate=DISCOUNT_RATE, dt=dt, smoothness=True
+        model, model.get_env(), args.eval_episodes, discount_rate=discount_rate, dt=dt, smoothness=True
     )
     return Run(callback.timesteps, callback.episodes, greedy, wall_seconds)
 
@@ -135,6 +134,8 @@ def main() -> None:
     parser.add_argument("--batch-size", type=int, default=128)
     parser.add_argument("--train-freq", type=int, default=1, help="environment steps between two trainings")
     parser.add_argument("--gradient-steps", type=int, default=-1, help="updates per training; -1 is one a step")
+    parser.add_argument("--gamma", type=float, default=0.98, help="discount factor over GAMMA_DT seconds, for both")
+    parser.add_argument("--gamma-dt", type=float, default=0.05, help="in s; 0 for a step (--gamma 0.99 is SAC's)")
     parser.add_argument("--d-max", type=float, default=0.3, help="CTCO's longest option, s")
     parser.add_argument("--eval-episodes", type=int, default=20)
     parser.add_argument("--window", type=int, default=10, help="episodes that a point of the curves averages")

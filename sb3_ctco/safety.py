@@ -24,7 +24,8 @@ class Safety:
 
     :param stale_after: an observation that is older than this is not acted on, in s; ``math.inf`` to act on any
     :param safe_action: what is sent then, or when the policy fails: ``"zero"``, which stops a machine that is commanded by
-        velocities, ``"hold"``, the last action once more, which stops one that is commanded by positions, or a function
+        velocities, ``"hold"``, the last action once more (zero while none is known), which stops one that is commanded by
+        positions, or a function
     :param max_rate: the largest change of an action, in widths of its box a second; None for no limit
     :param max_slew: the largest change of that rate, in widths a second, a second; None for no limit. It slows down in time
         to come to rest at what is commanded, so it follows commands a little late that move faster than it stops in a period
@@ -104,7 +105,9 @@ class Guard:
             action = self._safe_action()
             self.replaced[reason] += 1
             if reason != self._reason:  # once, and not at every tick
-                logger.warning("the safe action is sent (%s): %s", reason, action)
+                nothing = self._sent is None and self.safety.safe_action == "hold"
+                hint = ", since no last action is known: tell reset of it" if nothing else ""
+                logger.warning("the safe action is sent (%s): %s%s", reason, action, hint)
         self._reason = reason
         self._sent = self._limited(np.asarray(action, np.float64).clip(self.low, self.high), seconds)
         return self._sent.astype(self.low.dtype).clip(self.low, self.high)

@@ -26,10 +26,15 @@ def test_the_page_runs_against_a_robot_of_its_own_time(tmp_path):
         assert script.count("5005") == 1
         (tmp_path / "arm.py").write_text(script.replace("5005", port))
         environment = {**os.environ, "PYTHONPATH": f"{ROOT}{os.pathsep}{os.environ.get('PYTHONPATH', '')}"}
-        result = subprocess.run(
-            [sys.executable, "arm.py", "150"], cwd=tmp_path, env=environment, capture_output=True, text=True, check=False
-        )
-        assert result.returncode == 0, result.stderr
+
+        def run(n_steps):
+            command = [sys.executable, "arm.py", str(n_steps)]
+            result = subprocess.run(command, cwd=tmp_path, env=environment, capture_output=True, text=True, check=False)
+            assert result.returncode == 0, result.stderr
+            return result
+
+        result = run(150)
+        again = run(170)  # goes on, with what was shown before
     finally:
         robot.send_signal(signal.SIGTERM)
         report = json.loads(robot.stdout.read())
@@ -37,6 +42,7 @@ def test_the_page_runs_against_a_robot_of_its_own_time(tmp_path):
     added = [int(n) for n in re.findall(r"AddedTrajectory\(added=(\d+)", result.stdout)]
     assert len(added) == 2
     assert min(added) > 20
+    assert "AddedTrajectory" not in again.stdout
     # The robot was silent for 0.6 s in 4: less than 0.3 s is borne, and then joints are held, in learning and in playing.
     assert int(re.search(r"safe_ticks=(\d+)", result.stdout).group(1)) > 0
     assert re.search(r"replaced by the safe action: {'no fresh observation': \d+}", result.stdout)

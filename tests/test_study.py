@@ -766,6 +766,13 @@ def test_the_table_stands_beside_the_papers_numbers():
     assert "| cheetah run | SAC | large | 2 | 1.27 ± 1.27 | 0.35 ± 1.27 | 0.26 ± 1.27 | 0.27 ± 1.27 |" in lines
     assert any(line.startswith("| training | CTCO | tuned | ") and "[" in line for line in lines)
     assert lines[0].startswith("Preset quick (2400 s of task time); 2 seeds; commit abc1234.")
+    without = [{**record, "episode_return": math.nan, "greedy_episode_return": math.nan} for record in synthetic(1)]
+    assert "Sum of rewards" not in tables.table(without, {})
+    with_sums = [{**record, "episode_return": 250.0, "greedy_episode_return": math.nan} for record in synthetic(1)]
+    (sums,) = [part for part in tables.table(with_sums, {}).split("## ") if "um of rewards" in part]
+    assert sums.startswith("Sum of rewards, training episodes of the last tenth\n")
+    assert "| cheetah run | SAC | large | 1 | 250.00 | 250.00 | 250.00 | 250.00 |" in sums
+    assert "the paper's figure" not in sums
     assert "| cheetah run | SAC | large | 1 | 0.97 | 0.05 | -0.04 | -0.03 |" in tables.table(synthetic(1), {})
     assert "; 1 to 2 seeds; " in tables.table(synthetic()[1:], {})
 

@@ -74,12 +74,14 @@ _MAX_KEPT = 100_000
 
 
 def send_zero(env: gym.Env) -> None:
-    """Command zero, which stops a machine that is controlled by velocities.
+    """Command zero, or the nearest that actions may be, which stops a machine that is controlled by velocities.
 
     :param env: the bare environment, with ``send`` or only with ``step``; one whose episode has ended is left alone
     """
     space = env.action_space
     action = np.zeros(space.shape or (), dtype=space.dtype)
+    if isinstance(space, spaces.Box):
+        action = action.clip(space.low, space.high)
     if isinstance(env, SupportsSendReceive):
         env.send(action)
         return

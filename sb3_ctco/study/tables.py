@@ -23,6 +23,11 @@ METRICS = {
     "greedy_return": "discounted return,\ngreedy episodes",
     "decision_rate_hz": "decisions a second,\ntraining episodes of the last tenth",
 }
+#: What papers on Gymnasium's tasks report; a sum grows with the rate, so it is to be compared at one rate
+SUMS = {
+    "episode_return": "sum of rewards, training episodes of the last tenth",
+    "greedy_episode_return": "sum of rewards, greedy episodes",
+}
 
 
 def table(records: Sequence[Record], estimates: dict[str, Estimates]) -> str:
@@ -38,17 +43,20 @@ def table(records: Sequence[Record], estimates: dict[str, Estimates]) -> str:
         f"Preset {', '.join(presets)}; {seeds_in_words(records)}; commit {', '.join(commits)}. Means over seeds, ± half of "
         "the 95 % interval (Student's t) where there are at least two.\n"
     ]
-    for metric, name in METRICS.items():
+    for metric, name in {**METRICS, **SUMS}.items():
+        known = [record for record in records if math.isfinite(record.get(metric, math.nan))]  # older records have no sums
+        if not known:
+            continue
         parts.append(f"## {name.replace(chr(10), ' ').capitalize()}\n")
         parts.append(_row("task", "algorithm", "setting", "seeds", *(f"{rate} Hz" for rate in rates)))
         parts.append(_row(*["---"] * (4 + len(rates))))
-        for task in tasks_of(records):
-            for (algorithm, setting), values in by_line(records, task, metric).items():
+        for task in tasks_of(known):
+            for (algorithm, setting), values in by_line(known, task, metric).items():
                 numbers = sorted({len(one) for one in values.values()})
                 seeds = "–".join(str(number) for number in {numbers[0]: 0, numbers[-1]: 0})
                 cells = (_cell(values.get(rate, [])) for rate in rates)
                 parts.append(_row(find_task(task).label, ALGORITHMS[algorithm].label, setting, seeds, *cells))
-            if metric != "decision_rate_hz":
+            if metric in ("discounted_return", "greedy_return"):
                 for algorithm in ALGORITHMS:
                     numbers_of_paper = paper_returns().get((task, algorithm))
                     if numbers_of_paper is None:
