@@ -93,7 +93,7 @@ class OptionOffPolicyAlgorithm(OffPolicyAlgorithm):
     :raises ValueError: for settings out of range or contradicting each other or the environment's
     """
 
-    #: Arguments that ``load`` cannot change: what options mean, and what was learned or decides what is saved
+    #: Arguments that ``load`` cannot change: what options mean; subclasses add what was learned or decides what is saved
     _kept_when_loaded: ClassVar[tuple[str, ...]] = (
         "n_rbf",
         "d_max",
@@ -101,10 +101,6 @@ class OptionOffPolicyAlgorithm(OffPolicyAlgorithm):
         "trajectory",
         "duration_scale",
         "join",
-        "n_repetitions",
-        "ent_coef",
-        "duration_ent_coef",
-        "target_decision_rate",
     )
     #: An attribute that this class's files have and others' have not
     _own_setting: ClassVar[str] = "discount_rate"

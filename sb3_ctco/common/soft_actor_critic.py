@@ -3,7 +3,7 @@
 import contextlib
 import math
 from collections.abc import Callable, Iterator
-from typing import Any
+from typing import Any, ClassVar
 
 import torch as th
 from stable_baselines3.common.type_aliases import GymEnv, PyTorchObs, ReplayBufferSamples, Schedule
@@ -28,6 +28,12 @@ class SoftOptionActorCritic(OptionOffPolicyAlgorithm):
     :param duration_ent_coef: temperature of the duration, likewise
     :param target_entropy: entropy that learned temperatures keep, a function of the remaining progress, or ``"auto"``
     """
+
+    _kept_when_loaded: ClassVar[tuple[str, ...]] = (
+        *OptionOffPolicyAlgorithm._kept_when_loaded,
+        "ent_coef",
+        "duration_ent_coef",
+    )
 
     policy: SoftOptionPolicy
     actor: SquashedActor

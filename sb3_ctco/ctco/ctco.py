@@ -124,6 +124,7 @@ class CTCO(SoftOptionActorCritic):
     """
 
     _own_setting: ClassVar[str] = "high_freq_penalty"
+    _kept_when_loaded: ClassVar[tuple[str, ...]] = (*SoftOptionActorCritic._kept_when_loaded, "target_decision_rate")
 
     policy_aliases: ClassVar[dict[str, type[BasePolicy]]] = {
         "MlpPolicy": MlpPolicy,

@@ -1,7 +1,5 @@
 """Every task of dm_control's suite at any control period, as a Gymnasium environment that can play whole options."""
 
-import contextlib
-import logging
 import math
 import warnings
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -11,6 +9,7 @@ import gymnasium as gym
 import numpy as np
 from gymnasium import spaces
 
+from sb3_ctco.envs.quiet import without_deprecations
 from sb3_ctco.options import check_seconds
 
 try:
@@ -80,7 +79,7 @@ class DMControlEnv(gym.Env[np.ndarray, np.ndarray]):
             raise ValueError(f"render_mode must be None or 'rgb_array', not {render_mode!r}")
         if sparse and domain not in _SPARSE_REWARDS:
             raise ValueError(f"{domain} has no sparse reward here; these domains have one: {sorted(_SPARSE_REWARDS)}")
-        with _without_deprecations():
+        with without_deprecations():
             # Some models are drawn at random (lqr's): the same one each time. What reset draws follows from its seed.
             env = suite.load(domain, task, task_kwargs={"random": 0})
         self._task = env.task
@@ -285,21 +284,6 @@ def _rollout_inputs(model: mujoco.MjModel, data: mujoco.MjData, actions: np.ndar
     inputs = np.tile(inputs, (1, len(actions) * n_frames, 1))
     inputs[0, :, : model.nu] = np.repeat(actions, n_frames, axis=0)
     return inputs
-
-
-@contextlib.contextmanager
-def _without_deprecations() -> Iterator[None]:
-    """Keep to itself what MuJoCo says of attributes in dm_control's own models, which its users cannot change."""
-    logger = logging.getLogger("absl")
-
-    def is_wanted(record: logging.LogRecord) -> bool:
-        return "'settotalmass' is deprecated" not in record.getMessage()
-
-    logger.addFilter(is_wanted)
-    try:
-        yield
-    finally:
-        logger.removeFilter(is_wanted)
 
 
 def _leaves(observation: Mapping[str, Any]) -> Iterator[Any]:

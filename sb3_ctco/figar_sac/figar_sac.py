@@ -82,6 +82,7 @@ class FiGARSAC(SoftOptionActorCritic):
     """
 
     _own_setting: ClassVar[str] = "n_repetitions"
+    _kept_when_loaded: ClassVar[tuple[str, ...]] = (*SoftOptionActorCritic._kept_when_loaded, "n_repetitions")
 
     policy_aliases: ClassVar[dict[str, type[BasePolicy]]] = {
         "MlpPolicy": MlpPolicy,
