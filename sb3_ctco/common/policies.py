@@ -72,6 +72,20 @@ class EnsembleLinear(nn.Module):
         nn.init.zeros_(self.bias)
 
 
+def ensemble_mlp(
+    n_members: int, in_features: int, net_arch: list[int], out_features: int, activation_fn: type[nn.Module]
+) -> nn.Sequential:
+    """``n_members`` networks of one shape, evaluated together: Stable-Baselines3's ``create_mlp`` for an ensemble.
+
+    :param net_arch: sizes of the hidden layers
+    """
+    layers: list[nn.Module] = []
+    for size in net_arch:
+        layers += [EnsembleLinear(n_members, in_features, size), activation_fn()]
+        in_features = size
+    return nn.Sequential(*layers, EnsembleLinear(n_members, in_features, out_features))
+
+
 class SquashedActor(BasePolicy):
     """The body of an actor whose output is in [−1, 1]; subclasses add heads.
 
@@ -160,12 +174,8 @@ class EnsembleCritic(BaseModel):
         )
         self.n_critics = n_critics
         self.share_features_extractor = share_features_extractor
-        layers: list[nn.Module] = []
         in_features = features_dim + (action_space.shape[0] if option_dim is None else option_dim)
-        for out_features in net_arch:
-            layers += [EnsembleLinear(n_critics, in_features, out_features), activation_fn()]
-            in_features = out_features
-        self.q_networks = nn.Sequential(*layers, EnsembleLinear(n_critics, in_features, n_outputs))
+        self.q_networks = ensemble_mlp(n_critics, in_features, net_arch, n_outputs, activation_fn)
 
     def forward(self, obs: PyTorchObs, options: th.Tensor) -> th.Tensor:
         """Q-values, ``[n_critics, batch, n_outputs]``, of options ``[batch, option_dim]``."""

@@ -18,7 +18,7 @@ from stable_baselines3.common.type_aliases import PyTorchObs, Schedule
 from torch import nn
 from torch.nn import functional as F
 
-from sb3_ctco.common.policies import EnsembleLinear
+from sb3_ctco.common.policies import EnsembleLinear, ensemble_mlp
 
 
 def high_log_probs(
@@ -176,17 +176,13 @@ class DACPolicy(BasePolicy):
 
     def _networks(self, kind: Literal["pi", "vf"], n_members: int, n_outputs: int, head_gain: float) -> nn.Sequential:
         """Networks of one shape, evaluated together."""
-        layers: list[nn.Module] = []
-        in_features = self.features_extractor.features_dim
-        for out_features in self.net_arch.get(kind, []) if isinstance(self.net_arch, dict) else self.net_arch:
-            layers += [EnsembleLinear(n_members, in_features, out_features), self.activation_fn()]
-            in_features = out_features
-        layers.append(EnsembleLinear(n_members, in_features, n_outputs))
+        net_arch = self.net_arch.get(kind, []) if isinstance(self.net_arch, dict) else self.net_arch
+        networks = ensemble_mlp(n_members, self.features_extractor.features_dim, net_arch, n_outputs, self.activation_fn)
         if self.ortho_init:
-            for layer in layers:
+            for layer in networks:
                 if isinstance(layer, EnsembleLinear):
-                    layer.orthogonal_(head_gain if layer is layers[-1] else math.sqrt(2))
-        return nn.Sequential(*layers)
+                    layer.orthogonal_(head_gain if layer is networks[-1] else math.sqrt(2))
+        return networks
 
     def _get_constructor_parameters(self) -> dict[str, Any]:
         data = super()._get_constructor_parameters()
