@@ -13,6 +13,7 @@ import gymnasium as gym
 import numpy as np
 import torch as th
 from gymnasium.utils import EzPickle
+from stable_baselines3 import HerReplayBuffer
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.type_aliases import GymEnv
 from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv, VecEnvWrapper
@@ -34,11 +35,13 @@ def save_checkpoint(model: BaseAlgorithm, path: str | pathlib.Path) -> None:
     :param model: of this package or of Stable-Baselines3
     :param path: of the file, which is replaced once the new one is complete; it is a pickle, see :func:`load_checkpoint`
     :raises ValueError: if the environments' state cannot be saved: they are in other processes, or pickle cannot copy
-        them or makes them anew (Gymnasium's ``EzPickle``, as its MuJoCo robots are)
+        them or makes them anew (Gymnasium's ``EzPickle``, as its MuJoCo robots are); or of a ``HerReplayBuffer``
     """
     env = model.get_env()
     if env is None:
         raise ValueError("the model has no environment: a checkpoint is of a training, use save for a model alone")
+    if isinstance(getattr(model, "replay_buffer", None), HerReplayBuffer):
+        raise ValueError("a HerReplayBuffer, which computes rewards with the environment, cannot be saved to go on bit by bit")
     archive = io.BytesIO()
     model.save(archive)
     try:

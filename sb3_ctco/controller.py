@@ -334,9 +334,14 @@ class OptionController:
             self._observed_at = now if observed_at is None else observed_at
         age = now - self._observed_at
         low, high = self._box.low, self._box.high
-        n = 1 if self._first is None else len(self._first)
-        actions = low if n == 1 else np.broadcast_to(low, (n, *low.shape))
+        actions = low
+        if self._first is not None and len(self._first) > 1:
+            actions = np.broadcast_to(low, (len(self._first), *low.shape))
+        elif self._first is None and observation is not None and self._are_several(observation):
+            actions = np.broadcast_to(low, (len(_first_leaf(observation)), *low.shape))
         reason = None if age <= self.safety.stale_after else "no fresh observation"
+        if age < -self.safety.stale_after:
+            reason = "observed_at is of another clock than now"
         if reason is None:
             try:
                 actions = self._at(observation, now)
@@ -452,7 +457,10 @@ class OptionController:
         return self.option_space.before(self._box.normalise(sent))[0]
 
     def _are_several(self, observation: Observation) -> bool:
-        space: Any = self.policy.observation_space
+        # A policy of one's own, with free joins, may not tell.
+        space: Any = getattr(self.policy, "observation_space", None)
+        if space is None:
+            return False
         if isinstance(space, spaces.Dict):
             space = space[next(iter(observation)) if isinstance(observation, dict) else OBSERVATION]
         return np.ndim(_first_leaf(observation)) > len(space.shape)

@@ -94,6 +94,8 @@ def lerobot_trajectories(
             rows = rows[numbers["frame_index"][rows, 0].argsort(kind="stable")]
             terminated = terminates and "next.done" in others and bool(others["next.done"][rows[-1], 0])
             acted = rows if terminated else rows[:-1]
+            if not len(acted):
+                continue  # of one frame: nothing was done
             seen = np.append(rows, rows[-1]) if terminated else rows
             stacked = {key: numbers[name][seen] for key, name in columns.items()}
             observations: Stacked = stacked[""] if isinstance(observation, str) else stacked

@@ -1,5 +1,6 @@
 """Write a policy to a file that runs without PyTorch."""
 
+import os
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -95,6 +96,8 @@ def export_onnx(
     # A batch of two, because the exporter takes a batch of one for a constant.
     examples = tuple(th.as_tensor(np.stack([leaf.sample()] * 2), device=model.device) for leaf in named.values())
 
+    # A robot may read the file that is there meanwhile.
+    unfinished = Path(path).with_name(Path(path).name + ".unfinished")
     was_training = model.policy.training
     model.policy.set_training_mode(False)
     try:
@@ -102,7 +105,7 @@ def export_onnx(
         th.onnx.export(
             actor.eval().to(model.device),
             examples,
-            str(path),
+            str(unfinished),
             input_names=list(named),
             output_names=["option"],
             dynamic_shapes=(tuple({0: batch} for _ in named),),
@@ -113,10 +116,11 @@ def export_onnx(
     finally:
         model.policy.set_training_mode(was_training)
 
-    file = onnx.load(path)
+    file = onnx.load(unfinished)
     entry = file.metadata_props.add()
     entry.key, entry.value = METADATA_KEY, to_metadata(policy.option_space, policy.primitive_action_space, observations)
-    onnx.save(file, path)
+    onnx.save(file, unfinished)
+    os.replace(unfinished, path)
 
 
 def _shape(space: spaces.Space) -> tuple[int, ...]:

@@ -28,7 +28,8 @@ class Safety:
         positions, or a function
     :param max_rate: the largest change of an action, in widths of its box a second; None for no limit
     :param max_slew: the largest change of that rate, in widths a second, a second; None for no limit. It slows down in time
-        to come to rest at what is commanded, so it follows commands a little late that move faster than it stops in a period
+        to come to rest at what is commanded, so it follows commands a little late that move faster than it stops in a period.
+        It counts on ticks of one length: where a short one follows a late one, it may run past, by some hundredths of the box
     :raises ValueError: if a number is not positive, or ``safe_action`` is neither a function nor one of its names
     """
 
@@ -102,7 +103,7 @@ class Guard:
         if reason is None and not np.isfinite(action).all():
             reason = "the action is not finite"
         if reason is not None:
-            action = self._safe_action()
+            action = self.safe_action()
             self.replaced[reason] += 1
             if reason != self._reason:  # once, and not at every tick
                 nothing = self._sent is None and self.safety.safe_action == "hold"
@@ -117,7 +118,8 @@ class Guard:
         """Whether the last action was replaced by the safe one."""
         return self._reason is not None
 
-    def _safe_action(self) -> np.ndarray:
+    def safe_action(self) -> np.ndarray:
+        """What is to be sent when nothing else is, before limits."""
         sent = self._zero if self._sent is None else self._sent
         if not callable(self.safety.safe_action):
             return self._zero if self.safety.safe_action == "zero" else sent

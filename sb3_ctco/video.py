@@ -106,6 +106,8 @@ class RecordEpisodes(gym.Wrapper, RecordConstructorArgs):
 
     def _write(self) -> None:
         self._close_bar()
+        if not self._n_steps:  # of an episode that nobody played
+            self._frames = []
         if not self._frames:
             return
         from moviepy.video.io.ImageSequenceClip import ImageSequenceClip

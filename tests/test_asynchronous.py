@@ -11,6 +11,7 @@ import signal
 import subprocess
 import sys
 import textwrap
+import threading
 import time
 from pathlib import Path
 
@@ -954,7 +955,7 @@ def test_a_machine_without_a_learner_is_held_until_its_option_is_broken_off(tmp_
     trainer = AsynchronousTrainer(model, env, tmp_path)
     with trainer, pytest.raises(LearnerError, match="killed by signal SIGKILL"):
         trainer.learn(5000, KillLearner())
-    assert machine.commands[-2:] == [0.125, 0.0]  # the safe action, and then the safe stop
+    assert machine.commands[-2:] == [0.125, 0.125]  # the safe action, and then the safe stop, which is the same
     assert trainer.real_time.total_statistics.safe_ticks == 1
     assert "the safe action is sent (the learner was killed by signal SIGKILL)" in caplog.text
 
@@ -1140,3 +1141,132 @@ def test_learning_goes_on_from_all_that_was_learned_when_it_was_interrupted(tmp_
 def test_noise_that_is_a_function_of_the_state_is_refused(tmp_path):
     with pytest.raises(ValueError, match="use_sde=True is not supported"):
         AsynchronousTrainer(make_model(SAC, Point(), use_sde=True), Point(), tmp_path, real_time=False)
+
+
+class SlowStop:
+    """A safe stop that takes a while, in which signals come."""
+
+    def __init__(self, *signals):
+        self.signals, self.is_done = signals, False
+
+    def __call__(self, env):
+        for number in self.signals:
+            os.kill(os.getpid(), number)
+            time.sleep(0.05)
+        env.commands.append(0.25)
+        self.is_done = True
+
+
+class SignalAt(BaseCallback):
+    def __init__(self, number):
+        super().__init__()
+        self.number = number
+
+    def _on_step(self):
+        if self.n_calls == 20:
+            os.kill(os.getpid(), self.number)
+        return True
+
+
+@pytest.mark.parametrize("first", [signal.SIGINT, signal.SIGTERM])
+@pytest.mark.parametrize("second", [signal.SIGINT, signal.SIGTERM])
+def test_a_second_signal_does_not_break_off_the_safe_stop(tmp_path, caplog, first, second):
+    env, safe_stop = Point(), SlowStop(second)
+    before = signal.getsignal(first), signal.getsignal(second)
+    trainer = AsynchronousTrainer(make_model(SAC, env), env, tmp_path, safe_stop=safe_stop)
+    with trainer, pytest.raises(KeyboardInterrupt if first == signal.SIGINT else SystemExit):
+        trainer.learn(5000, SignalAt(first))
+    assert safe_stop.is_done
+    assert env.commands[-1] == 0.25
+    assert "the machine is being made safe; once more breaks that off" in caplog.text
+    assert (signal.getsignal(first), signal.getsignal(second)) == before
+    assert len(records_of(tmp_path)) > 10
+
+
+def test_a_third_signal_breaks_it_off(tmp_path):
+    env, safe_stop = Point(), SlowStop(signal.SIGINT, signal.SIGINT)
+    trainer = AsynchronousTrainer(make_model(SAC, env), env, tmp_path, safe_stop=safe_stop)
+    with trainer, pytest.raises(KeyboardInterrupt):
+        trainer.learn(5000, SignalAt(signal.SIGINT))
+    assert not safe_stop.is_done
+
+
+class SilentMachine(Machine):
+    """Falls silent after some commands, until it is told to speak."""
+
+    def __init__(self, silent_after):
+        super().__init__()
+        self.silent_after, self.speaks = silent_after, threading.Event()
+
+    def receive(self):
+        if len(self.commands) == self.silent_after:
+            self.speaks.wait()
+        return super().receive()
+
+
+@pytest.mark.parametrize("decide_ahead", [0.0, 0.06])
+def test_a_machine_that_says_nothing_is_stopped(tmp_path, monkeypatch, decide_ahead):
+    """Also where it is waited for in the background, where no signal ends that."""
+    monkeypatch.setattr(trainer_module, "_ABANDON_SECONDS", 0.2)
+    machine, stopped = SilentMachine(silent_after=100), []
+    env = gym.wrappers.TimeLimit(machine, 1000)
+    model = make_model(CTCO, env, d_min=0.1, d_max=0.2)
+    trainer = AsynchronousTrainer(
+        model, env, tmp_path, safe_stop=lambda env: stopped.append(env.speaks.is_set()), decide_ahead=decide_ahead
+    )
+    threading.Timer(30.0, machine.speaks.set).start()  # the end of a hang
+
+    def interrupt():
+        while len(machine.commands) < 100:
+            time.sleep(0.01)
+        time.sleep(0.3)
+        os.kill(os.getpid(), signal.SIGINT)
+
+    threading.Thread(target=interrupt, daemon=True).start()
+    try:
+        with pytest.raises(KeyboardInterrupt):
+            trainer.learn(5000)
+        assert stopped == [False]  # before it spoke again
+    finally:
+        machine.speaks.set()
+    trainer.__exit__()
+
+
+def test_positions_that_are_held_stay_held(tmp_path):
+    """Zero, the default where nothing is guarded, would be somewhere else."""
+    machine = Machine()
+    reset = machine.reset
+    machine.reset = lambda **kwargs: (reset(**kwargs)[0], {"last_action": np.array([1.0], np.float32)})
+    real_time = RealTimeWrapper(machine, safety=Safety(safe_action="hold", max_rate=0.5, max_slew=None))
+    env = gym.wrappers.TimeLimit(real_time, 1000)
+    with AsynchronousTrainer(make_model(SAC, env), env, tmp_path) as trainer:
+        trainer.learn(30)
+    # 0.5 widths of 2 a second are 0.02 a step.
+    assert np.abs(np.diff([1.0, *machine.commands])).max() <= 0.02 + 1e-6
+    assert machine.commands[-1] == pytest.approx(machine.commands[-2])
+
+
+def test_after_an_error_the_model_is_what_the_learner_saved(tmp_path):
+    """And not an actor that learned beside critics that did not."""
+    env = Point(fail_at=200)
+    model = make_model(SAC, env)
+    trainer = AsynchronousTrainer(model, env, tmp_path, updates_per_second=100)
+    with trainer, pytest.raises(ConnectionError, match="the cable was pulled"):
+        trainer.learn(5000)
+    saved = SAC.load(tmp_path / "model.zip", device="cpu")
+    assert saved._n_updates == model._n_updates > 0
+    for name, value in saved.policy.state_dict().items():
+        assert th.equal(value, model.policy.state_dict()[name]), name
+
+
+def test_experience_is_restored_once(tmp_path):
+    env = Point()
+    with AsynchronousTrainer(make_model(SAC, env), env, tmp_path, real_time=False) as trainer:
+        trainer.learn(60)
+        trainer.restore_replay_buffer()
+        size = trainer.model.replay_buffer.size()
+        with pytest.raises(ValueError, match=f"holds {size} transitions already"):
+            trainer.restore_replay_buffer()
+        trainer.model.replay_buffer.reset()
+        trainer.restore_replay_buffer()
+        assert trainer.model.replay_buffer.size() == size

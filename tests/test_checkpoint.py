@@ -6,8 +6,9 @@ import gymnasium as gym
 import numpy as np
 import pytest
 import torch as th
-from stable_baselines3 import SAC
+from stable_baselines3 import SAC, HerReplayBuffer
 from stable_baselines3.common.env_util import make_vec_env
+from stable_baselines3.common.envs import BitFlippingEnv
 from stable_baselines3.common.noise import OrnsteinUhlenbeckActionNoise
 from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecNormalize
 
@@ -147,3 +148,12 @@ def test_an_environment_made_otherwise_is_refused(random_walk_env, tmp_path):
         with pytest.raises(ValueError, match=r"the checkpoint's is 1 in \['DummyVecEnv'\]"):
             load_checkpoint(CTCO, tmp_path / "checkpoint", env)
     assert isinstance(load_checkpoint(CTCO, tmp_path / "checkpoint", random_walk_env()).get_env(), DummyVecEnv)
+
+
+def test_hindsight_is_refused(tmp_path):
+    """HerReplayBuffer computes rewards with an environment, which pickle does not keep."""
+    env = BitFlippingEnv(n_bits=4, continuous=True, max_steps=5)
+    model = SAC("MultiInputPolicy", env, replay_buffer_class=HerReplayBuffer, policy_kwargs={"net_arch": [8]})
+    with pytest.raises(ValueError, match=r"HerReplayBuffer.*cannot be saved"):
+        save_checkpoint(model, tmp_path / "checkpoint")
+    assert not (tmp_path / "checkpoint").exists()

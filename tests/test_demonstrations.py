@@ -348,7 +348,7 @@ def test_a_minari_dataset_that_a_script_recorded(tmp_path):
 
 @pytest.mark.parametrize("one_file_an_episode", [True, False])
 def test_lerobot_datasets_are_read(tmp_path, one_file_an_episode):
-    """Versions 2 and 3 of the format: frames of two episodes of 6 and 4, the second of which is not done."""
+    """Versions 2 and 3 of the format: frames of episodes of 6, 4 and 1, the latter two of which are not done."""
     import pyarrow
     from pyarrow import parquet
 
@@ -356,8 +356,8 @@ def test_lerobot_datasets_are_read(tmp_path, one_file_an_episode):
     (tmp_path / "meta" / "info.json").write_text('{"fps": 20}')
     folder = tmp_path / "data" / "chunk-000"
     folder.mkdir(parents=True)
-    episode, frame = np.array([0] * 6 + [1] * 4), np.array([*range(6), *range(4)])
-    order = np.array([3, 1, 2, 0, *range(4, 10)])  # rows need not be in order
+    episode, frame = np.array([0] * 6 + [1] * 4 + [2]), np.array([*range(6), *range(4), 0])
+    order = np.array([3, 1, 2, 0, *range(4, 11)])  # rows need not be in order
     vectors = pyarrow.list_(pyarrow.float32(), 2)
     columns = {
         "episode_index": pyarrow.array(episode[order]),

@@ -308,3 +308,15 @@ def test_a_segment_that_a_power_cut_left_empty_is_put_aside(tmp_path, caplog, le
     check_meaning(tmp_path, MEANING)
     write(tmp_path, [5])
     assert read(tmp_path) == [3, 4, 5]
+
+
+def test_nothing_is_added_to_a_journal_that_is_closed(tmp_path):
+    writer = JournalWriter(tmp_path, MEANING)
+    writer.close()
+    with pytest.raises(ValueError, match="is closed"):
+        writer.add({"number": np.zeros(1)})
+    writer = JournalWriter(tmp_path, MEANING)
+    writer.add({"number": np.zeros(1)})
+    writer.close()
+    with pytest.raises(ValueError, match="is closed"):
+        writer.add({"number": np.ones(1)})

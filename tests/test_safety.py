@@ -121,6 +121,7 @@ class Policy:
 
     option_space = OptionSpace.make(n_rbf=1, d_max=0.4, d_min=0.4, dt=0.1, discount_rate=0.4)
     primitive_action_space = spaces.Box(LOW, HIGH)
+    observation_space = spaces.Box(-np.inf, np.inf, (3,))
     value: float | Exception = 0.5
 
     def __init__(self):
@@ -187,7 +188,9 @@ def test_a_policy_that_fails(failure, n, caplog):
 def test_a_policy_that_fails_at_once():
     policy, controller = make_controller()
     policy.value = float("nan")
-    np.testing.assert_array_equal(controller(np.zeros((3, 3)), now=0.0), [0, 0])
+    action = controller(np.zeros((3, 3)), now=0.0)
+    assert action.shape == (3, 2)
+    np.testing.assert_array_equal(action, 0.0)
     policy.value = 0.5
     np.testing.assert_array_equal(controller(np.zeros((3, 3)), now=0.1), [HALF] * 3)
 
@@ -501,3 +504,37 @@ def test_what_was_sent_is_asked_in_the_machines_actions_only():
         TakeOverWrapper(rescaled(), lambda obs: None, print)
     OptionExecutionWrapper(rescaled())
     OptionExecutionWrapper(rescaled(safety=None), join="continuous")
+
+
+def test_a_time_of_another_clock_is_no_fresh_observation():
+    """Stamps of the wall clock, by which an observation would stay fresh for decades."""
+    _, controller = make_controller()
+    np.testing.assert_array_equal(controller(np.zeros(3), now=1.0, observed_at=1.7e9), [0, 0])
+    np.testing.assert_array_equal(controller(None, now=1.1), [0, 0])
+    assert controller.replaced == {"observed_at is of another clock than now": 2}
+    np.testing.assert_array_equal(controller(np.zeros(3), now=1.2, observed_at=1.25), HALF)  # clocks differ by a little
+
+    machine = Machine()
+    env = RealTimeWrapper(machine, clock=FakeClock(), safety=Safety(**UNLIMITED))
+    env.reset()
+    machine.age = -1.7e9
+    for _ in range(3):
+        env.step(np.array([0.5], np.float32))
+    assert machine.commands == [0.5, 0.0, 0.0]
+
+
+def test_options_take_the_time_that_they_say_on_a_machine():
+    arguments = {"n_rbf": 1, "d_max": 1.0, "dt": 0.1}
+    machine = Machine()
+    machine.dt = 0.02
+    with pytest.raises(ValueError, match=r"RealTimeWrapper inside has dt=0\.02 s, and options here have dt=0\.1 s"):
+        RealTimeOptionWrapper(RealTimeWrapper(machine, clock=FakeClock()), **arguments)
+    env = RealTimeOptionWrapper(RealTimeWrapper(machine, clock=FakeClock()), **{**arguments, "dt": 0.02})
+    env.reset()
+    assert env.step([0.0, 1.0])[-1]["option"]["n_steps"] == 50
+
+
+def test_there_is_nothing_to_hold_before_the_first_action(caplog):
+    controller = OptionController(Policy(), safety=Safety(safe_action="hold", **UNLIMITED))
+    np.testing.assert_array_equal(controller(np.zeros(3), now=1.0, observed_at=0.0), [0, 0])
+    assert "since no last action is known: tell reset of it" in caplog.text

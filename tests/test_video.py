@@ -130,3 +130,12 @@ def test_watch_films_the_task_that_its_arguments_name(tmp_path, opengl):
     result = subprocess.run(command, capture_output=True, text=True, cwd=tmp_path, check=True)
     assert re.search(r"return 0\.0|return [0-9]", result.stdout)
     assert duration_and_fps(tmp_path / "watch" / "episode-0.mp4") == (21, 20.0)
+
+
+def test_an_episode_that_nobody_played_has_no_video(tmp_path):
+    """A VecEnv resets once more at the end of the last episode."""
+    env = RecordEpisodes(Canvas(last=50), tmp_path)
+    play(env)
+    env.reset()
+    env.close()
+    assert [file.name for file in env.files] == ["episode-0.mp4"]

@@ -1,6 +1,7 @@
 """Hold an environment to the wall clock."""
 
 import logging
+import math
 import time
 from dataclasses import dataclass
 from typing import Any, Literal, Protocol, SupportsFloat, runtime_checkable
@@ -176,7 +177,10 @@ class RealTimeWrapper(gym.Wrapper, RecordConstructorArgs):
         else:
             obs, reward, terminated, truncated, info = self.env.step(action)
             self._wait()
-        self._observed_at = self.clock.now() - info.get(OBSERVATION_AGE, 0.0)
+        age = info.get(OBSERVATION_AGE, 0.0)
+        if self.guard is not None and age < -self.guard.safety.stale_after:
+            age = math.inf  # A time of another clock does not tell it.
+        self._observed_at = self.clock.now() - age
         info = {**info, "real_time": {"lateness": lateness}}
         if self.guard is not None:
             info = {LAST_ACTION: action, **info}

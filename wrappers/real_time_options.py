@@ -1,7 +1,8 @@
 """Options on a machine that does not wait: decided ahead of time, and interrupted when the world changes."""
 
+import math
 from collections.abc import Callable, Sequence
-from concurrent.futures import Future, ThreadPoolExecutor
+from concurrent.futures import Future, ThreadPoolExecutor, wait
 from copy import deepcopy
 from typing import Any, SupportsFloat
 
@@ -94,6 +95,11 @@ class RealTimeOptionWrapper(OptionExecutionWrapper):
         self._play: StepSequence | None = None
         self.interrupt = interrupt
         real_time = unwrap_wrapper(env, RealTimeWrapper)
+        if isinstance(real_time, RealTimeWrapper) and not math.isclose(real_time.dt, self.option_space.dt, rel_tol=1e-6):
+            raise ValueError(
+                f"the RealTimeWrapper inside has dt={real_time.dt} s, and options here have dt={self.option_space.dt} s, so "
+                f"that they would take another time than they say: pass dt={real_time.dt}, at which they last as long"
+            )
         self._is_guarded = isinstance(real_time, RealTimeWrapper) and real_time.guard is not None
         self._is_lost = False
 
@@ -167,14 +173,18 @@ class RealTimeOptionWrapper(OptionExecutionWrapper):
     def _choose_play(self) -> StepSequence:
         return self._play_around_decisions
 
-    def abandon(self) -> None:
-        """Stop playing, at the next primitive step; needs a reset then."""
+    def abandon(self, timeout: float | None = None) -> bool:
+        """Stop playing, at the next primitive step; needs a reset then.
+
+        :param timeout: for how long to wait for the step that is being made in the background, in s; None for its end
+        :return: whether nothing is played any more
+        """
         self._abandoned = True
         self._play = None
         self._rest = None
         playing, self._playing_rest = self._playing_rest, None
-        if playing is not None:
-            playing.exception()  # waits, and whatever it raised is of no interest any more
+        # Whatever it raised is of no interest any more.
+        return playing is None or not wait([playing], timeout).not_done
 
     def close(self) -> None:
         """Stop playing and close the environment."""

@@ -87,8 +87,11 @@ class JournalWriter:
         :param record: arrays of numbers that nobody changes afterwards, by name, or dictionaries of such
         :param n_transitions: how many transitions it is to a replay buffer
         :raises OSError: if an earlier record could not be written
+        :raises ValueError: after ``close``
         """
         self._raise_if_failed()
+        if self._file.closed and not (self._thread is not None and self._thread.is_alive()):
+            raise ValueError(f"the journal in {self.folder} is closed")
         if self._thread is None:
             # Only here, so that it has the priority of the thread that adds: it must not hold that one up by being slow
             # to let go of the interpreter.

@@ -69,6 +69,8 @@ AlgorithmType = TypeVar("AlgorithmType", bound=OffPolicyAlgorithm)
 _START_SECONDS = 120.0
 #: How long it may take to stop and save before it is killed, in s
 _STOP_SECONDS = 60.0
+#: How long a step may take in the background before the machine is stopped without its end, in s
+_ABANDON_SECONDS = 1.0
 #: How many decisions' times are kept
 _MAX_KEPT = 100_000
 
@@ -80,8 +82,10 @@ def send_zero(env: gym.Env) -> None:
     """
     space = env.action_space
     action = np.zeros(space.shape or (), dtype=space.dtype)
-    if isinstance(space, spaces.Box):
-        action = action.clip(space.low, space.high)
+    _send(env, action.clip(space.low, space.high) if isinstance(space, spaces.Box) else action)
+
+
+def _send(env: gym.Env, action: np.ndarray) -> None:
     if isinstance(env, SupportsSendReceive):
         env.send(action)
         return
@@ -99,7 +103,7 @@ class AsynchronousTrainer(Generic[AlgorithmType]):
     end of either process, and is deleted only when as much that is newer fills the replay buffer. Weights come back
     through shared memory, with a version, and are picked up between two decisions. Callbacks, the logger and the progress
     bar are those of ``model.learn``; the model that they see has the weights in use, but critics and optimizers only once
-    learning is over. ``folder/model.zip`` is the learner's checkpoint, with all of them.
+    learning is over, also by an error. ``folder/model.zip`` is the learner's checkpoint, with all of them.
 
     However learning ends (Ctrl-C, SIGTERM, an exception on either side, a learner that was killed), the last command is
     the safe one; then the learner ends its round of updates (0.1 s, or one update), saves and stops. A script that uses
@@ -119,7 +123,8 @@ class AsynchronousTrainer(Generic[AlgorithmType]):
         machine that lost its power for instance, is dropped with a warning, and kept as a copy. ``model.zip`` is a file of
         Stable-Baselines3, and to read it may run code that is in it: resume only what is yours
     :param real_time: whether to hold the wall-clock period; False plays a simulation as fast as it goes
-    :param safe_stop: called with the bare environment to leave the machine in a safe state; by default it commands zero
+    :param safe_stop: called with the bare environment to leave the machine in a safe state; by default it commands the safe
+        action of a guarded ``RealTimeWrapper``, and zero where nothing is guarded
     :param updates_per_second: at most so many updates; None for as many as the learner's processor can do
     :param learner_device: device to learn on
     :param learner_threads: torch's threads of the learner; None for torch's own choice
@@ -265,7 +270,15 @@ class AsynchronousTrainer(Generic[AlgorithmType]):
                 # What acts has the learner's actor, and critics from before.
                 self._load_checkpoint()
             self._is_unfinished = True
-            self._learn(total_timesteps, remaining, callback, log_interval, tb_log_name, progress_bar)
+            try:
+                self._learn(total_timesteps, remaining, callback, log_interval, tb_log_name, progress_bar)
+            except BaseException:
+                # As far as it was saved, so that nobody goes on with critics that know nothing of the actor.
+                try:
+                    self._load_checkpoint()
+                except Exception:
+                    logger.exception("the model is not what the learner learned")
+                raise
             self._load_checkpoint()
             self._is_unfinished = False
         return model
@@ -299,24 +312,25 @@ class AsynchronousTrainer(Generic[AlgorithmType]):
         try:
             process.start()
             learner_end.close()
-            with _sigterm_as_exit():
-                link.wait_until_ready()
-                if self.real_time is not None:
-                    self.real_time.alarm = None  # an earlier learner's
-                self._supervisor.check = lambda: self._look_at(link)
-                with _prompt_threads(), _scheduled(self.acting_priority):
-                    self._act(in_between, journal, remaining, callbacks, log_interval, tb_log_name, progress_bar)
-        finally:
-            self._supervisor.check = None
-            try:
-                self._make_safe()
-            finally:
+            with _one_signal() as none_more:
                 try:
-                    journal.close()
-                    self._demonstrations.close()
+                    link.wait_until_ready()
+                    if self.real_time is not None:
+                        self.real_time.alarm = None  # an earlier learner's
+                    self._supervisor.check = lambda: self._look_at(link)
+                    with _prompt_threads(), _scheduled(self.acting_priority):
+                        self._act(in_between, journal, remaining, callbacks, log_interval, tb_log_name, progress_bar)
                 finally:
-                    stop.value = True
-                    link.join()
+                    none_more()
+                    self._supervisor.check = None
+                    self._make_safe()
+        finally:
+            try:
+                journal.close()
+                self._close_demonstrations()
+            finally:
+                stop.value = True
+                link.join()
         link.raise_if_failed()
 
     def _act(
@@ -376,15 +390,28 @@ class AsynchronousTrainer(Generic[AlgorithmType]):
         with _alone_in(self.folder):
             self._demonstrations = JournalWriter(self._demonstration_folder, _meaning(self.model))
             self._keep_demonstration(trajectory)
-            self._demonstrations.close()
+            self._close_demonstrations()
         return added
 
+    def _close_demonstrations(self) -> None:
+        demonstrations, self._demonstrations = self._demonstrations, None
+        assert demonstrations is not None
+        demonstrations.close()
+
     def _keep_demonstration(self, trajectory: RecordedTrajectory) -> None:
-        assert self._demonstrations is not None
+        if self._demonstrations is None:
+            logger.warning("what somebody else played outside of learn is not kept")
+            return
         self._demonstrations.add(trajectory._asdict())
 
     def restore_replay_buffer(self) -> None:
         """Fill the model's own replay buffer with everything that was collected, for instance to learn on in place."""
+        buffer: Any = self.model.replay_buffer
+        if buffer.size():
+            raise ValueError(
+                f"the model's replay buffer holds {buffer.size()} transitions already, which may be the same ones: call this "
+                "once, or reset it before, model.replay_buffer.reset()"
+            )
         for folder in filter(segments, (self._demonstration_folder, self._journal_folder)):
             journal = JournalReader(folder)
             while fill_replay_buffer(self.model, journal, 1000):
@@ -402,13 +429,16 @@ class AsynchronousTrainer(Generic[AlgorithmType]):
 
     def _make_safe(self) -> None:
         option_env = unwrap_wrapper(self.model.env.envs[0], RealTimeOptionWrapper)  # type: ignore[union-attr]
-        if isinstance(option_env, RealTimeOptionWrapper):
-            option_env.abandon()
         # Learning that goes on begins with a reset.
         self.model._last_obs = None
         try:
-            if self._supervisor.has_commanded:
-                self.safe_stop(self.bare_env)
+            try:
+                # Somebody who waits for a machine that says nothing would wait for ever.
+                if isinstance(option_env, RealTimeOptionWrapper) and not option_env.abandon(_ABANDON_SECONDS):
+                    logger.error("a step in the background has not ended within %.1f s", _ABANDON_SECONDS)
+            finally:
+                if self._supervisor.has_commanded:
+                    self._stop()
         except Exception as error:
             if self._supervisor.has_stepped or error.__context__ is None:
                 raise
@@ -417,6 +447,13 @@ class AsynchronousTrainer(Generic[AlgorithmType]):
         finally:
             if self._take_over is not None:
                 self._take_over.hand_over()
+
+    def _stop(self) -> None:
+        guard = None if self.real_time is None else self.real_time.guard
+        if self.safe_stop is not send_zero or self.real_time is None or guard is None:
+            self.safe_stop(self.bare_env)
+        else:  # what the guard sends, zero may be far from where joints are held
+            _send(self.real_time.env, guard.safe_action().astype(guard.low.dtype).clip(guard.low, guard.high))
 
     def _load_checkpoint(self) -> None:
         path = self.folder / "model.zip"
@@ -756,20 +793,37 @@ class _DecidedEnv(VecEnvWrapper):
 
 
 @contextmanager
-def _sigterm_as_exit() -> Iterator[None]:
-    """A SIGTERM ends the block by SystemExit, so that what follows it is done."""
+def _one_signal() -> Iterator[Callable[[], None]]:
+    """The first SIGTERM ends the block by SystemExit, the first SIGINT as it does outside, so that what follows is done.
+
+    A second one does not break that off; the third does. It yields a function after which also the first does not.
+    """
+    n_signals = 0
+
+    def none_more() -> None:
+        nonlocal n_signals
+        n_signals = max(n_signals, 1)
+
     if threading.current_thread() is not threading.main_thread():
-        yield
+        yield none_more
         return
 
-    def leave(signum: int, frame: Any) -> None:
-        raise SystemExit(128 + signum)
+    def handle(number: int, frame: Any) -> None:
+        nonlocal n_signals
+        n_signals += 1
+        if n_signals == 2:
+            logger.warning("%s: the machine is being made safe; once more breaks that off", signal.Signals(number).name)
+        elif number == signal.SIGTERM:
+            raise SystemExit(128 + number)
+        elif callable(before[number]):
+            before[number](number, frame)
 
-    before = signal.signal(signal.SIGTERM, leave)
+    before: dict[int, Any] = {number: signal.signal(number, handle) for number in (signal.SIGTERM, signal.SIGINT)}
     try:
-        yield
+        yield none_more
     finally:
-        signal.signal(signal.SIGTERM, before)
+        for number, handler in before.items():
+            signal.signal(number, handler)
 
 
 @contextmanager
