@@ -54,7 +54,9 @@ class Task:
         dt = find_dt(env)
         if dt is None or not math.isclose(dt, 1.0 / rate, rel_tol=1e-3):
             known = "does not tell its rate" if dt is None else f"runs at {1 / dt:g} Hz"
-            raise ValueError(f"task {self.name} {known}, not at {rate} Hz: its rates must be a list of that one")
+            whole = dt is None or math.isclose(round(1 / dt) * dt, 1.0, rel_tol=1e-3)
+            hint = "its rates must be a list of that one" if whole else "a study needs a whole number of Hz"
+            raise ValueError(f"task {self.name} {known}, not at {rate} Hz: {hint}")
         return env
 
     def seconds_of_episode(self, rate: int) -> float:
@@ -202,7 +204,11 @@ def _with_reward_rate(make_env: Callable[[], gym.Env], dt: float, discount_rate:
 
 def _make_dac_ppo(make_env: Callable[[], gym.Env], dt: float, arguments: dict[str, Any]) -> DACPPO:
     discount_rate = discount_rate_from_gamma(arguments["gamma"], arguments["gamma_dt"])
-    env = _with_reward_rate(make_env, dt, discount_rate, arguments.pop("n_envs", 1))
+    n_envs = arguments.pop("n_envs", 1)
+    env = _with_reward_rate(make_env, dt, discount_rate, n_envs)
+    # The environments have seeds from this one on, which are not to be those of the next run.
+    seed = arguments.pop("seed", None)
+    arguments["seed"] = None if seed is None else seed * n_envs
     return DACPPO(env=VecNormalize(env, norm_reward=False), **{"policy": "MlpPolicy", **arguments})
 
 

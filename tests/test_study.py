@@ -454,7 +454,7 @@ def test_a_run_whose_process_always_dies_fails(finished, tmp_path, monkeypatch):
     assert "exit code 7" in (folder / run.name / "error.txt").read_text()
 
 
-def dies(connection, folder):
+def dies(connection, folder, gym_packages):
     connection.recv()
     os._exit(7)
 
@@ -748,13 +748,42 @@ def test_scores_by_hand(few_resamples):
     assert list(scores.improvement(without, ("ctco", "a"))["sac", "a"]) == [500]
 
 
-def test_the_pareto_figure_joins_the_settings_of_an_algorithm():
+def test_sac_stands_in_with_runs_as_long_of_one_setting_and_once():
+    longer = [{**record, "task_seconds": 6000.0, "seed": record["seed"] + 10} for record in synthetic()]
+    small = [{**record, "setting": "small"} for record in synthetic(1) if record["algorithm"] == "sac"]
+    own = [{**record, "setting": "20ms", "algorithm": "sac_repeat"} for record in synthetic(1) if record["algorithm"] == "sac"]
+    records = scores.with_equal_repeats([*with_repeats(), *longer, *small, *own])
+    lines = scores.by_line(records, "cheetah", "discounted_return")
+    assert len(lines["sac_repeat", "20ms"][50]) == 2  # seed 0 its own, seed 1 SAC's
+    assert len(lines["sac_repeat", "best"][50]) == 2
+
+
+def test_the_best_repeat_has_as_many_seeds_as_any():
+    lucky = [{**r, "setting": "50steps", "discounted_return": 9.0} for r in with_repeats() if r["setting"] == "25steps"]
+    records = scores.with_equal_repeats([*with_repeats(), *(record for record in lucky if record["seed"] == 0)])
+    assert 9.0 not in scores.by_line(records, "cheetah", "discounted_return")["sac_repeat", "best"][500]
+
+
+def test_the_same_seed_of_two_presets_is_no_second_seed(tmp_path):
+    one = write_csv(tmp_path / "one.csv", synthetic())
+    other = write_csv(tmp_path / "other.csv", [{**record, "preset": "native"} for record in synthetic()])
+    with pytest.raises(ValueError, match=r"of preset native, and preset quick has it, too: they are no two seeds"):
+        plots.plot([one, other], tmp_path / "figures")
+
+
+def test_settings_of_an_algorithm_look_different():
+    lines = [("sac_repeat", f"{n}steps") for n in (1, 2, 5, 10, 25, 50)] + [("sac_repeat", "20ms")]
+    assert len({str(plots._style(line, lines)[0]) for line in lines}) == len(lines)
+
+
+def test_the_pareto_figure_names_the_settings_of_an_algorithm():
     figure = plots.draw_pareto(with_repeats(), "discounted_return")
     assert len(figure.axes) == 4 * 3
     ax = next(ax for ax in figure.axes if ax.get_title() == "cheetah run, 500 Hz")
     points = {container.get_label(): container.lines[0].get_xydata().tolist() for container in ax.containers}
     assert points["SAC, action repeat"][0] == [20.0, 2.0]
     assert [x for x, _ in points["SAC, action repeat"]] == sorted(x for x, _ in points["SAC, action repeat"])
+    assert {"5steps", "25steps", "20ms", "large"} == {text.get_text() for text in ax.texts}
 
 
 def test_the_table_stands_beside_the_papers_numbers():

@@ -84,8 +84,8 @@ def _run(args: argparse.Namespace) -> int:
     from sb3_ctco.study.agents import constructor_arguments
     from sb3_ctco.study.engines import import_packages, run_local, run_on_ray
     from sb3_ctco.study.grid import load_preset
-    from sb3_ctco.study.records import without_recorded
-    from sb3_ctco.study.runs import RECORD, plan
+    from sb3_ctco.study.records import read_records, without_recorded
+    from sb3_ctco.study.runs import RECORD, git_commit, plan
 
     if args.workers is not None and args.workers < 1:
         raise ValueError(f"--workers must be at least 1, not {args.workers}")
@@ -100,7 +100,8 @@ def _run(args: argparse.Namespace) -> int:
         constructor_arguments(run)  # So that a mistake in the preset shows at once.
     if args.skip_records is not None:
         runs = without_recorded(runs, args.skip_records)
-        print(f"{len(runs)} runs are not in {args.skip_records}")
+        commits = ", ".join(sorted({record["commit"] for record in read_records(args.skip_records)}))
+        print(f"{len(runs)} runs are not in {args.skip_records}, whose rows are of commits {commits}; this is {git_commit()}")
         if not runs:
             return COMPLETE
     folder = (args.folder or Path("runs/study") / preset.name).resolve()

@@ -41,7 +41,8 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-_DASHES = ("-", "-.", ":")
+#: Of an algorithm's settings; "--" is the paper's
+_DASHES: tuple[Any, ...] = ("-", "-.", ":", (0, (6, 2, 1, 2, 1, 2)), (0, (1, 3)), (0, (8, 2)), (0, (3, 1)), (0, (2, 2, 6, 2)))
 _DECISION_RATES = (1, 2, 5, 10, 20, 50, 100, 200, 500)
 
 
@@ -104,10 +105,12 @@ def plot(
 def _merged(sources: Sequence[Path]) -> list[Record]:
     """The records of all sources, each run once.
 
-    :raises ValueError: if a run is there with different settings, or if runs of different lengths would make one mean
+    :raises ValueError: if a run is there with different settings, or if runs of different lengths, or the same seed of two
+        presets, would make one mean
     """
     merged: dict[tuple[Any, ...], Record] = {}
     lengths: dict[tuple[Any, ...], Record] = {}
+    seeds: dict[tuple[Any, ...], Record] = {}
     for source in sources:
         for record in read_records(source):
             there = merged.setdefault(key(record), record)
@@ -117,6 +120,13 @@ def _merged(sources: Sequence[Path]) -> list[Record]:
                 raise ValueError(
                     f"{source} has runs of preset {record['preset']} with {record['task_seconds']:g} s of task time, and "
                     f"preset {of_mean['preset']} has {of_mean['task_seconds']:g} s: they make no mean, plot one of them"
+                )
+            task, line, seed = record["task"], line_of(record), record["seed"]
+            of_seed = seeds.setdefault((task, line, rate_of(record), seed), record)
+            if of_seed["preset"] != record["preset"]:
+                raise ValueError(
+                    f"{source} has seed {seed} of {line} on {task} of preset {record['preset']}, and preset "
+                    f"{of_seed['preset']} has it, too: they are no two seeds, plot one of them"
                 )
     return list(merged.values())
 
@@ -230,7 +240,7 @@ def _together(curves: Sequence[Sequence[tuple[float, float]]]) -> dict[float, li
 
 
 def draw_pareto(records: Sequence[Record], metric: str) -> "Figure":
-    """Return over decisions a second: a row a rate, a column a task, a point a setting; three or more are joined."""
+    """Return over decisions a second: a row a rate, a column a task, a point a setting, by its name."""
     tasks, lines = tasks_of(records), lines_of(records)
     rates = sorted({rate_of(record) for record in records})
     figure, axes = _panels(len(rates), len(tasks))
@@ -240,12 +250,13 @@ def draw_pareto(records: Sequence[Record], metric: str) -> "Figure":
             decisions = {line: float(np.mean(of[rate])) for line, of in by_line(here, task, "decision_rate_hz").items()}
             returns = {line: mean_and_interval(of[rate]) for line, of in by_line(here, task, metric).items()}
             for algorithm in dict.fromkeys(line[0] for line in lines):
-                swept = sorted((decisions[line], *returns[line]) for line in returns if line[0] == algorithm)
+                swept = sorted((decisions[line], *returns[line], line[1]) for line in returns if line[0] == algorithm)
                 if swept:
-                    x, y, half_width = np.array(swept).T
-                    row_of = ALGORITHMS[algorithm]
-                    style: dict[str, Any] = {"fmt": "o-" if len(swept) > 2 else "o", "color": row_of.colour, "linewidth": 0.8}
-                    ax.errorbar(x, y, half_width, label=row_of.label, markersize=4, capsize=2, **style)
+                    x, y, half_width, settings = zip(*swept, strict=True)
+                    style: dict[str, Any] = {"fmt": "o", "color": ALGORITHMS[algorithm].colour, "linewidth": 0.8}
+                    ax.errorbar(x, y, half_width, label=ALGORITHMS[algorithm].label, markersize=4, capsize=2, **style)
+                    for at, value, setting in zip(x, y, settings, strict=True):
+                        ax.annotate(setting, (at, value), (3, 3), textcoords="offset points", fontsize=6)
             ax.set_xscale("log")
             ax.set_xticks(_DECISION_RATES, [str(tick) for tick in _DECISION_RATES])
             ax.minorticks_off()

@@ -87,15 +87,25 @@ def with_equal_repeats(records: Sequence[Record]) -> list[Record]:
 
     An action that is held for one step, or for 20 ms at 50 Hz, is SAC itself. Of the settings of ``sac_repeat`` in steps, that
     with the best mean return in training is kept for each task and rate that has any, as setting ``best``: it is chosen by
-    what it is judged by, which favours it. What is held for a time that is whole steps competes with them.
+    what it is judged by, which favours it. What is held for a time that is whole steps competes with them, and settings with
+    fewer seeds than another do not. SAC stands in with runs as long as the others, of the setting that has most of them.
     """
     repeats = [record for record in records if record["algorithm"] == "sac_repeat"]
     if not repeats:
         return list(records)
-    sac = [{**record, "algorithm": "sac_repeat"} for record in records if record["algorithm"] == "sac"]
+    lengths = {(record["task"], record["task_seconds"]) for record in repeats}
+    as_long = [
+        record for record in records if record["algorithm"] == "sac" and (record["task"], record["task_seconds"]) in lengths
+    ]
+    ((usual, _),) = Counter(record["setting"] for record in as_long).most_common(1) or [("", 0)]
+    sac = [{**record, "algorithm": "sac_repeat"} for record in as_long if record["setting"] == usual]
     held = {record["setting"] for record in repeats if not record["setting"].endswith(STEPS)}
     kept = [record for record in records if record["algorithm"] != "sac_repeat" or record["setting"] in held]
-    kept += [{**record, "setting": name} for record in sac if (name := f"{1000 * record['dt']:g}ms") in held]
+    there = {(record["setting"], record["task"], record["dt"], record["seed"]) for record in repeats}
+    for record in sac:
+        name = f"{1000 * record['dt']:g}ms"
+        if name in held and (name, record["task"], record["dt"], record["seed"]) not in there:
+            kept.append({**record, "setting": name})
     cells: dict[tuple[str, int], dict[str, list[Record]]] = defaultdict(lambda: defaultdict(list))
     for record in [*sac, *repeats]:
         if record["setting"] not in held or _is_whole_steps(record):
@@ -103,7 +113,7 @@ def with_equal_repeats(records: Sequence[Record]) -> list[Record]:
     for of_setting in cells.values():
         if not any(setting.endswith(STEPS) for setting in of_setting):
             continue
-        best = max(of_setting.values(), key=lambda group: float(np.mean([one["discounted_return"] for one in group])))
+        best = max(of_setting.values(), key=lambda group: (len(group), np.mean([one["discounted_return"] for one in group])))
         kept += [{**record, "setting": BEST} for record in best]
     return kept
 

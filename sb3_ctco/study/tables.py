@@ -68,8 +68,8 @@ def table(records: Sequence[Record], estimates: dict[str, Estimates]) -> str:
         parts.append("")
     parts.append("## Interquartile means\n")
     parts.append(
-        "Over tasks and seeds, of discounted return × τ (a fraction of the most that a reward of 1 a second can give), with "
-        "95 % intervals of rliable's stratified bootstrap where there are at least two seeds.\n"
+        "Over tasks and seeds, of discounted return × 0.404/s (with the paper's discount a fraction of the most that a reward "
+        "of 1 a second can give), with 95 % intervals of rliable's stratified bootstrap where there are at least two seeds.\n"
     )
     parts.append(_row("episodes", "algorithm", "setting", *(f"{rate} Hz" for rate in rates)))
     parts.append(_row(*["---"] * (3 + len(rates))))
