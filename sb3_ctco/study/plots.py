@@ -256,7 +256,8 @@ def draw_pareto(records: Sequence[Record], metric: str) -> "Figure":
                     style: dict[str, Any] = {"fmt": "o", "color": ALGORITHMS[algorithm].colour, "linewidth": 0.8}
                     ax.errorbar(x, y, half_width, label=ALGORITHMS[algorithm].label, markersize=4, capsize=2, **style)
                     for at, value, setting in zip(x, y, settings, strict=True):
-                        ax.annotate(setting, (at, value), (3, 3), textcoords="offset points", fontsize=6)
+                        where: dict[str, Any] = {"xytext": (-3, 3), "ha": "right"} if at > 100 else {"xytext": (3, 3)}
+                        ax.annotate(setting, (at, value), textcoords="offset points", fontsize=6, **where)
             ax.set_xscale("log")
             ax.set_xticks(_DECISION_RATES, [str(tick) for tick in _DECISION_RATES])
             ax.minorticks_off()
