@@ -25,7 +25,8 @@ class SupportsStepSequence(Protocol):
     the last step terminated or truncated the episode, and the last step's info. ``observe`` lists, in increasing order
     and below ``n_steps``, the numbers of steps after which the observation is wanted, too: ``info["observations"]`` has
     those that came before the episode's end, in a list. It is passed only if sub-options are wanted
-    (``n_sub_options``); an environment whose ``step_sequence(actions)`` does not take it is stepped in a loop then.
+    (``n_sub_options``); an environment whose ``step_sequence(actions)`` does not take it is stepped in a loop then, and
+    always one whose class, below that which defines ``step_sequence``, defines another ``step``.
     """
 
     def step_sequence(self, actions: np.ndarray, observe: Sequence[int] = ()) -> SequenceResult:

@@ -420,8 +420,9 @@ class OptionOffPolicyAlgorithm(OffPolicyAlgorithm):
             space = self._check_env(self.env)
             self.dt, self.d_min = space.dt, space.d_min
         super()._setup_model()
-        if self.train_freq.frequency < 1:  # type: ignore[union-attr]
-            raise ValueError(f"train_freq must be at least 1, not {self.train_freq.frequency}")  # type: ignore[union-attr]
+        train_freq: Any = self.train_freq  # a TrainFreq by now
+        if train_freq.frequency < 1:
+            raise ValueError(f"train_freq must be at least 1, not {train_freq.frequency}")
         if self.env is None:
             self._tell_buffer()
         else:
@@ -525,7 +526,8 @@ class OptionOffPolicyAlgorithm(OffPolicyAlgorithm):
         if self.env is not None and self._was_moved(self.env):
             self._last_obs = None  # begin with a reset
         model = super().learn(total_timesteps, callback, log_interval, name, reset_num_timesteps, progress_bar)
-        self._env_calls = self.env.get_attr("n_calls")  # type: ignore[union-attr]
+        assert self.env is not None
+        self._env_calls = self.env.get_attr("n_calls")
         return model
 
     def _was_moved(self, env: VecEnv) -> bool:

@@ -59,9 +59,8 @@ class CTCO(SoftOptionActorCritic):
     IROS 2023, https://arxiv.org/abs/2212.04407
 
     Where it differs from the paper, the paper's way is an argument away, and :meth:`paper_defaults` has those that the paper
-    gives a value of: Bézier
-    curves (``trajectory="rbf"``), durations on a logarithmic scale (``duration_scale="linear"``) from a shortest one that
-    follows from the discount (``d_min=0`` is one step), sub-options (``n_sub_options=0``), a relative β_h
+    gives a value of: Bézier curves (``trajectory="rbf"``), durations on a logarithmic scale (``duration_scale="linear"``) from
+    a shortest one that follows from the discount (``d_min=0`` is one step), sub-options (``n_sub_options=0``), a relative β_h
     (``high_freq_penalty=0.05``), entropy relative to the uniform distribution (``entropy_reference="paper"``, with linear
     durations), learned temperatures (``ent_coef`` as a number, the paper's β_E) and two critics
     (``policy_kwargs=dict(n_critics=1)``). One thing has no argument: ω is squashed by tanh, so that actions stay in their
