@@ -36,6 +36,7 @@ def make_model(env: gym.Env, rate: int, seed: int, **kwargs: Any) -> CTCO:
         n_sub_options=4,
         d_max=1.0,
         high_freq_penalty=0.02,
+        entropy_reference="uniform",  # as when docs/visual_reacher.md was measured
         policy_kwargs={
             "net_arch": {"pi": [10, 10], "qf": [64, 64]},
             "features_extractor_class": SpatialSoftmaxExtractor,

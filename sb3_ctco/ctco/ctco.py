@@ -61,8 +61,8 @@ class CTCO(SoftOptionActorCritic):
     Where it differs from the paper, the paper's way is an argument away, and :meth:`paper_defaults` has those that the paper
     gives a value of: Bézier curves (``trajectory="rbf"``), durations on a logarithmic scale (``duration_scale="linear"``) from
     a shortest one that follows from the discount (``d_min=0`` is one step), sub-options (``n_sub_options=0``), a relative β_h
-    (``high_freq_penalty=0.05``), entropy relative to the uniform distribution (``entropy_reference="paper"``, with linear
-    durations), learned temperatures (``ent_coef`` as a number, the paper's β_E) and two critics
+    (``high_freq_penalty=0.05``), entropy relative to its average (``entropy_reference="paper"``, with linear durations),
+    learned temperatures (``ent_coef`` as a number, the paper's β_E) and two critics
     (``policy_kwargs=dict(n_critics=1)``). One thing has no argument: ω is squashed by tanh, so that actions stay in their
     bounds. The class's own settings were measured to learn faster on the paper's tasks.
 
@@ -105,7 +105,7 @@ class CTCO(SoftOptionActorCritic):
         trajectory and one for d, or ``"auto_0.1"`` to start them at 0.1
     :param target_entropy: entropy of an option over the box [−1, 1] that learned temperatures keep, in equal parts for each
         entry of ω and d, or a function of the remaining progress; ``"auto"`` is −dim(ω) − 1
-    :param entropy_reference: ``"uniform"``, ``"average"`` or ``"paper"``, see :func:`log_reference_density`
+    :param entropy_reference: ``"average"``, ``"uniform"`` or ``"paper"``, see :func:`log_reference_density`
     :param fast_updates: whether to compute gradients without autograd where that is known to give the same, see
         :mod:`sb3_ctco.ctco.fast_update`; ``fast_updates_refusal`` says why not where it is not
     :param action_noise: noise added to normalised options while exploring
@@ -162,7 +162,7 @@ class CTCO(SoftOptionActorCritic):
         target_decision_rate: float | None = None,
         ent_coef: str | float = "auto_0.02",
         target_entropy: str | float | Schedule = "auto",
-        entropy_reference: EntropyReference = "uniform",
+        entropy_reference: EntropyReference = "average",
         fast_updates: bool = True,
         action_noise: ActionNoise | None = None,
         replay_buffer_class: type[ReplayBuffer] | None = None,
