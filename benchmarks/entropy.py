@@ -1,4 +1,4 @@
-"""Draw decisions a second and returns over training, for what entropy counts relative to.
+"""Draw decisions a second and returns over training, for what entropy is relative to.
 
 sb3-ctco study run --preset benchmarks/entropy.yml --folder runs/entropy
 python benchmarks/entropy.py runs/entropy
@@ -12,7 +12,7 @@ import matplotlib as mpl
 import matplotlib.pyplot as plt
 import numpy as np
 
-LABELS = {"uniform": "relative to uniform (default)", "paper": "log π, the paper's"}
+LABELS = {"average": "relative to its average (default)", "uniform": "relative to uniform", "paper": "log π, the paper's"}
 #: Episodes that a point averages
 WINDOW = 10
 

@@ -170,7 +170,7 @@ def test_the_price_of_a_decision_is_the_penalty_alone(scripted_env):
 
 def test_a_decision_is_never_paid_for_its_entropy():
     """Relative to the uniform distribution the expected cost is a KL divergence, at least 0."""
-    model = make(random_walk_like(), ent_coef=1.0)
+    model = make(random_walk_like(), ent_coef=1.0, entropy_reference="uniform")
     _, log_prob = model.actor.option_log_prob(th.zeros(4096, 2))
     assert model.entropy_costs(log_prob @ model._parts).mean() > -0.05
     # With the paper's density the same policy is paid at each decision.
@@ -558,7 +558,8 @@ def batch_of(model, n=16):
     return batch
 
 
-def test_one_update_by_hand(random_walk_env):
+@pytest.mark.parametrize("entropy_reference", ["average", "uniform"])
+def test_one_update_by_hand(entropy_reference, random_walk_env):
     """The critic's loss that train logs, recomputed from the networks with β_h, γ(d) and both entropies."""
     model = make(
         random_walk_env(),
@@ -567,6 +568,7 @@ def test_one_update_by_hand(random_walk_env):
         ent_coef=0.2,
         high_freq_penalty=0.05,
         trajectory="rbf",
+        entropy_reference=entropy_reference,
     )
     set_temperature_of_d(model, 0.4)
     model.learn(200)
@@ -580,7 +582,11 @@ def test_one_update_by_hand(random_walk_env):
         options, log_prob = model.actor.option_log_prob(batch.observations)
         next_options, next_log_prob = model.actor_target.option_log_prob(batch.next_observations)
         total = lambda p: p.sum(dim=1, keepdim=True)  # noqa: E731
-        cost = lambda p: 0.2 * (total(p[:, :-1]) + 3 * math.log(2)) + 0.4 * (p[:, -1:] + math.log(2))  # noqa: E731
+        if entropy_reference == "uniform":
+            cost = lambda p: 0.2 * (total(p[:, :-1]) + 3 * math.log(2)) + 0.4 * (p[:, -1:] + math.log(2))  # noqa: E731
+        else:
+            price = lambda p: 0.2 * total(p[:, :-1]) + 0.4 * p[:, -1:]  # noqa: E731
+            cost = lambda p: price(p) - price(p).mean()  # noqa: E731
         next_q = model.critic_target(batch.next_observations, next_options).min(dim=0)[0]
         bootstrap = (1 - batch.dones) * batch.discounts * (next_q - cost(next_log_prob))
         target = batch.rewards - 0.05 + bootstrap
