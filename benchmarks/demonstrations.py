@@ -67,6 +67,7 @@ TASKS = {
             "d_max": 1.0,
             "n_sub_options": 4,
             "high_freq_penalty": 0.02,
+            "entropy_reference": "uniform",
             "batch_size": 32,
             "buffer_size": 120_000,
             "updates_per_second": 4,

@@ -87,6 +87,7 @@ def main() -> None:
             learning_starts=round(60.0 / MovingTarget.dt),
             updates_per_second=20,
             high_freq_penalty=0.02,
+            entropy_reference="uniform",
             policy_kwargs={"net_arch": {"pi": [64, 64], "qf": [128, 128]}},
             seed=seed,
             device="cpu",

@@ -25,7 +25,7 @@ def learned() -> dict[str, dict[str, th.Tensor]]:
     by_autograd = {**OFF_POLICY, "policy_kwargs": {"net_arch": [32], "activation_fn": nn.Tanh}}
     models = {
         "CTCO": CTCO("MlpPolicy", "Pendulum-v1", **OFF_POLICY).learn(400),
-        "CTCO, average": CTCO("MlpPolicy", "Pendulum-v1", entropy_reference="average", **OFF_POLICY).learn(400),
+        "CTCO, uniform": CTCO("MlpPolicy", "Pendulum-v1", entropy_reference="uniform", **OFF_POLICY).learn(400),
         "CTCO, autograd": CTCO("MlpPolicy", "Pendulum-v1", **by_autograd).learn(400),
         "FiGAR-SAC": FiGARSAC("MlpPolicy", "Pendulum-v1", **OFF_POLICY).learn(400),
         "DAC-PPO": DACPPO("MlpPolicy", "Pendulum-v1", n_steps=200, **SMALL).learn(800),

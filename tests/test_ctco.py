@@ -222,7 +222,7 @@ def test_the_temperature_has_sacs_name(random_walk_env):
 
 
 def test_what_a_decision_costs_is_logged(random_walk_env):
-    model = make(random_walk_env(), high_freq_penalty=0.25).learn(40)
+    model = make(random_walk_env(), high_freq_penalty=0.25, entropy_reference="uniform").learn(40)
     model.train(1, 8)
     logged = model.logger.name_to_value
     next_q_values, costs = model._last_next_values

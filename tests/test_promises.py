@@ -57,6 +57,7 @@ def test_deviations_are_those_of_the_code():
         "d_min",
     }
     assert defaults["high_freq_penalty"] == "relative_0.1"
+    assert defaults["entropy_reference"] == "average"
     assert f"clamped to [−{-LOG_STD_MIN:.0f}, {LOG_STD_MAX:.0f}]" in TEXT
 
 

@@ -62,7 +62,7 @@ def log_reference_density(sizes: th.Tensor, d_min: float, d_max: float, referenc
     ``"paper"`` is the unit density over (ω, d in s): log π as it stands.
 
     :param sizes: how many entries of an option each density is of, the duration being the last, ``[n + 1]``
-    :return: likewise
+    :return: likewise, or None for ``"average"``
     """
     if reference == "average":
         return None
