@@ -12,7 +12,7 @@ from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.type_aliases import PolicyPredictor
 from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv, unwrap_vec_normalize
 
-from sb3_ctco.options import DEFAULT_DISCOUNT_RATE, PENDING, ActionBox, discount, step_weight
+from sb3_ctco.options import DEFAULT_DISCOUNT_RATE, PENDING, ActionBox, RewardUnit, discount, step_weight
 
 
 def mean_absolute_jerk(actions: npt.ArrayLike, dt: float) -> float:
@@ -122,6 +122,7 @@ class _EpisodeTracker:
     n_envs: int
     discount_rate: float
     dt: float | None
+    reward_unit: RewardUnit
     running: list[EpisodeStatistics] = field(init=False)
     #: Primitive steps of the running episodes, and of those that ended last
     n_steps: list[int] = field(init=False)
@@ -144,7 +145,8 @@ class _EpisodeTracker:
             if "option" in info:
                 duration, integral = info["option"]["duration"], info["option"]["integrated_reward"]
             elif self.dt is not None:
-                duration, integral = self.dt, float(reward) * step_weight(self.dt, self.discount_rate)
+                weight = step_weight(self.dt, self.discount_rate) if self.reward_unit == "rate" else 1.0
+                duration, integral = self.dt, float(reward) * weight
             else:
                 raise ValueError("these steps are no options: pass dt, the environment's interaction period in seconds")
             episode = self.running[i]
@@ -202,6 +204,7 @@ def evaluate_discounted_return(
     discount_rate: float | None = None,
     dt: float | None = None,
     smoothness: bool = False,
+    reward_unit: RewardUnit = "rate",
 ) -> list[EpisodeStatistics]:
     """Play whole episodes.
 
@@ -212,6 +215,8 @@ def evaluate_discounted_return(
     :param discount_rate: τ, in 1/s; by default the environment's where steps are options, and the paper's 0.404 elsewhere
     :param dt: interaction period in s, needed where steps are no options
     :param smoothness: whether to measure the smoothness of the primitive actions as well, normalised to [−1, 1]
+    :param reward_unit: where steps are no options, ``"rate"`` or ``"impulse"``, see
+        :func:`~sb3_ctco.options.integrated_reward`; options have their environment's
     :return: one entry an episode
     :raises ValueError: if the environment's options are discounted at another rate, or if smoothness is asked for where
         actions are not in a Box with finite bounds
@@ -219,7 +224,7 @@ def evaluate_discounted_return(
     if not isinstance(env, VecEnv):
         single = env
         env = DummyVecEnv([lambda: single])
-    tracker = _EpisodeTracker(env.num_envs, _find_discount_rate(env, discount_rate), dt)
+    tracker = _EpisodeTracker(env.num_envs, _find_discount_rate(env, discount_rate), dt, reward_unit)
     recorder = _ActionRecorder(env) if smoothness else None
     episodes: list[EpisodeStatistics] = []
     obs = env.reset()
@@ -252,13 +257,15 @@ class DiscountedReturnCallback(BaseCallback):
 
     :param discount_rate: τ, in 1/s; by default the environment's where steps are options, and the paper's 0.404 elsewhere
     :param dt: interaction period in s, needed where the algorithm's steps are no options
+    :param reward_unit: where they are none, ``"rate"`` or ``"impulse"``, see :func:`~sb3_ctco.options.integrated_reward`
     :raises ValueError: when training starts, if the environment's options are discounted at another rate
     """
 
-    def __init__(self, discount_rate: float | None = None, dt: float | None = None):
+    def __init__(self, discount_rate: float | None = None, dt: float | None = None, reward_unit: RewardUnit = "rate"):
         super().__init__()
         self.discount_rate = discount_rate
         self.dt = dt
+        self.reward_unit: RewardUnit = reward_unit
         self._tracker: _EpisodeTracker | None = None
         #: Episodes in the order of their ends, and the algorithm's number of steps then.
         self.episodes: list[EpisodeStatistics] = []
@@ -267,7 +274,9 @@ class DiscountedReturnCallback(BaseCallback):
     def _on_training_start(self) -> None:
         env, goes_on = self.training_env, self.locals.get("reset_num_timesteps") is False
         if not (goes_on and self._tracker is not None and self._tracker.n_envs == env.num_envs):
-            self._tracker = _EpisodeTracker(env.num_envs, _find_discount_rate(env, self.discount_rate), self.dt)
+            self._tracker = _EpisodeTracker(
+                env.num_envs, _find_discount_rate(env, self.discount_rate), self.dt, self.reward_unit
+            )
         # Episodes that run already may not have been seen from their beginning, or may never end.
         self._torn = set(range(env.num_envs)) if goes_on else set()
 

@@ -93,6 +93,7 @@ def export_onnx(
     actor_network = model.policy.actor
     assert isinstance(actor_network, nn.Module)
     actor = _GreedyActor(actor_network, list(named) if isinstance(space, spaces.Dict) else None, policy.vec_normalize)
+    metadata = to_metadata(policy.option_space, policy.primitive_action_space, observations)
     # A batch of two, because the exporter takes a batch of one for a constant.
     examples = tuple(th.as_tensor(np.stack([leaf.sample()] * 2), device=model.device) for leaf in named.values())
 
@@ -113,14 +114,14 @@ def export_onnx(
             external_data=False,
             verbose=False,
         )
+        file = onnx.load(unfinished)
+        entry = file.metadata_props.add()
+        entry.key, entry.value = METADATA_KEY, metadata
+        onnx.save(file, unfinished)
+        os.replace(unfinished, path)
     finally:
         model.policy.set_training_mode(was_training)
-
-    file = onnx.load(unfinished)
-    entry = file.metadata_props.add()
-    entry.key, entry.value = METADATA_KEY, to_metadata(policy.option_space, policy.primitive_action_space, observations)
-    onnx.save(file, unfinished)
-    os.replace(unfinished, path)
+        unfinished.unlink(missing_ok=True)
 
 
 def _shape(space: spaces.Space) -> tuple[int, ...]:

@@ -8,7 +8,7 @@ import numpy as np
 import numpy.typing as npt
 from gymnasium import spaces
 
-from sb3_ctco.options import LAST_ACTION, OPTIONS_OF_0_1_0, OptionSpace
+from sb3_ctco.options import OPTIONS_OF_0_1_0, OptionSpace
 
 Observation = npt.NDArray[Any] | dict[str, npt.NDArray[Any]]
 
@@ -95,7 +95,8 @@ def to_metadata(settings: OptionSpace, action_space: spaces.Box, observations: d
             "action_high": action_space.high.tolist(),
             "action_dtype": str(action_space.dtype),
             "observations": observations,
-        }
+        },
+        default=lambda number: number.item(),  # numpy's
     )
 
 
@@ -175,4 +176,4 @@ def _observation_space(observations: dict[str, tuple[tuple[int, ...], str]]) -> 
         dtype: Any = np.dtype(kind)
         low, high = {"f": (-np.inf, np.inf), "b": (0, 1)}.get(dtype.kind) or (np.iinfo(dtype).min, np.iinfo(dtype).max)
         boxes[name] = spaces.Box(low, high, shape, dtype)
-    return spaces.Dict(boxes) if LAST_ACTION in boxes else next(iter(boxes.values()))
+    return boxes["observation"] if boxes.keys() == {"observation"} else spaces.Dict(boxes)

@@ -26,10 +26,12 @@ class RecordEpisodes(gym.Wrapper, RecordConstructorArgs):
     :param env: an environment whose ``render_mode`` is ``"rgb_array"``
     :param folder: where the videos go
     :param fps: frames per second, at most one a step
-    :param name: the files are ``<name>-<number of the episode>.mp4``
+    :param name: the files are ``<name>-<number>.mp4``, numbered from 0, or from where those of before end; environments side
+        by side need a name each
     :param dt: interaction period, in s; by default what :func:`~sb3_ctco.wrappers.find_dt` finds
     :param progress: whether to show a progress bar of the frames
     :raises ValueError: for another render mode, or if ``dt`` is not given and not found
+    :raises ImportError: without moviepy
     """
 
     def __init__(
@@ -48,6 +50,11 @@ class RecordEpisodes(gym.Wrapper, RecordConstructorArgs):
         dt = find_dt(env, required_by=type(self).__name__, given=dt)
         if not fps > 0:
             raise ValueError(f"fps must be positive, not {fps}")
+        try:
+            from moviepy.video.io.ImageSequenceClip import ImageSequenceClip
+        except ImportError as error:
+            raise ImportError("a video needs moviepy: in a clone of sb3-ctco, run pip install '.[render]'") from error
+        self._clip = ImageSequenceClip
         self.folder, self.name, self.dt, self.progress = Path(folder), name, dt, progress
         self.fps = min(fps, 1.0 / dt)
         #: Files that were written
@@ -83,8 +90,10 @@ class RecordEpisodes(gym.Wrapper, RecordConstructorArgs):
 
     def close(self) -> None:
         """Write what an episode that has not ended has, and close the environment."""
-        self._write()
-        super().close()
+        try:
+            self._write()
+        finally:
+            super().close()
 
     def _film(self) -> None:
         try:
@@ -110,10 +119,10 @@ class RecordEpisodes(gym.Wrapper, RecordConstructorArgs):
             self._frames = []
         if not self._frames:
             return
-        from moviepy.video.io.ImageSequenceClip import ImageSequenceClip
-
         self.folder.mkdir(parents=True, exist_ok=True)
-        file = self.folder / f"{self.name}-{len(self.files)}.mp4"
-        ImageSequenceClip(self._frames, fps=self.fps).write_videofile(str(file), logger=None)
+        number = len(self.files)
+        while (file := self.folder / f"{self.name}-{number}.mp4").exists():  # of an earlier recording
+            number += 1
+        self._clip(self._frames, fps=self.fps).write_videofile(str(file), logger=None)
         self.files.append(file)
         self._frames = []

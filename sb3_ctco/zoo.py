@@ -18,6 +18,8 @@ from collections.abc import Sequence
 from importlib import resources
 from typing import Any
 
+import gymnasium as gym
+
 try:
     import optuna
     import rl_zoo3.enjoy
@@ -37,7 +39,7 @@ from sb3_ctco import registry
 from sb3_ctco.common.load_arguments import constructor_parameters
 from sb3_ctco.common.option_algorithm import OptionOffPolicyAlgorithm
 from sb3_ctco.envs.quiet import mute_deprecated_attributes
-from sb3_ctco.wrappers import OptionExecutionWrapper
+from sb3_ctco.wrappers import OptionExecutionWrapper, find_dt
 
 #: The package's algorithms by their names in the Zoo.
 ALGORITHMS: dict[str, type[BaseAlgorithm]] = {
@@ -103,11 +105,19 @@ class OptionExperimentManager(ExperimentManager):
         return hyperparams, saved
 
     def objective(self, trial: optuna.Trial) -> float:
-        """Value of one trial, in environments that share its options' settings."""
+        """Value of one trial, in environments that share its options' settings.
+
+        :raises optuna.TrialPruned: if the sampled settings make no model
+        """
         # A copy, because trials run in threads if --n-jobs is more than one.
         manager = copy.copy(self)
         manager._trial = trial
-        return super(OptionExperimentManager, manager).objective(trial)
+        try:
+            return super(OptionExperimentManager, manager).objective(trial)
+        except ValueError as error:
+            # Of settings that contradict the environment's, such as a d_max below its step
+            print(f"Trial {trial.number} has settings that make no model: {error}")
+            raise optuna.TrialPruned from error
 
     def create_envs(self, n_envs: int, eval_env: bool = False, no_log: bool = False) -> VecEnv:
         """The Zoo's; within a trial with the settings that it sampled, and without sub-options to evaluate in."""
@@ -130,6 +140,11 @@ class OptionExperimentManager(ExperimentManager):
         assert issubclass(algorithm, OptionOffPolicyAlgorithm)
         parameters = constructor_parameters(algorithm)
         arguments = {name: hyperparams.get(name, parameter.default) for name, parameter in parameters.items()}
+        if "n_repetitions" in arguments and arguments["dt"] is None:
+            # Repetitions are whole steps, and how long one is only the environment knows.
+            env = gym.make(self.env_name.gym_id, **(hyperparams.get("env_kwargs") or self.env_kwargs))
+            arguments["dt"] = find_dt(env)
+            env.close()
         return [*wrappers, {WRAPPER: algorithm.wrapper_kwargs(arguments)}]
 
 

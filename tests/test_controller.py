@@ -299,6 +299,24 @@ def test_exported_policy_of_other_observations(tmp_path, kind):
     for _ in range(3):
         obs = model.observation_space.sample()
         np.testing.assert_allclose(policy(obs), model.predict(obs, deterministic=True)[0], atol=1e-5)
+    if kind == "dict":
+        # In another order than the space's, and with another shape first
+        one = dict(reversed(model.observation_space.sample().items()))
+        played, expected = (OptionController(source)(one) for source in (tmp_path / "model.onnx", model))
+        assert played.shape == (2,)
+        np.testing.assert_allclose(played, expected, atol=1e-5)
+
+
+def test_what_cannot_be_exported_leaves_no_file(tmp_path):
+    class Unnamed(RadialBasis):
+        pass
+
+    with pytest.raises(ValueError, match="Unnamed has no name"):
+        export_onnx(CTCO("MlpPolicy", "Pendulum-v1", trajectory=Unnamed, buffer_size=10), tmp_path / "model.onnx")
+    assert not list(tmp_path.iterdir())
+    export_onnx(CTCO("MlpPolicy", "Pendulum-v1", n_rbf=np.int64(2), buffer_size=10), tmp_path / "model.onnx")
+    assert [file.name for file in tmp_path.iterdir()] == ["model.onnx"]
+    assert OnnxPolicy(tmp_path / "model.onnx").option_space.trajectory.n_weights == 2
 
 
 @pytest.fixture(scope="module")

@@ -179,6 +179,14 @@ def test_first_states_do_not_depend_on_the_period(domain, task, sparse):
     np.testing.assert_array_equal(*first)
 
 
+@pytest.mark.parametrize("action", [0.5, [0.5], [[0.5] * 6]])
+def test_an_action_of_another_shape(action):
+    env = gym.make("sb3_ctco/cheetah-run-v0", disable_env_checker=True).unwrapped
+    env.reset(seed=0)
+    with pytest.raises(ValueError, match=r"an action must have shape \(6,\), not "):
+        env.step(np.array(action, np.float32))
+
+
 def test_seeds():
     env = make("cheetah", "run", dt=0.01)
 

@@ -70,6 +70,22 @@ def test_returns_of_both_kinds_are_the_integral_by_hand():
     assert by_options.decision_rate_hz == pytest.approx(4.0)
 
 
+def test_impulses_count_alike_by_steps_and_by_options():
+    expected = sum(k * math.exp(-TAU * DT * (k - 1)) for k in range(1, 11))
+    kwargs = {"discount_rate": TAU, "reward_unit": "impulse"}
+    (plain,) = evaluate_discounted_return(Scripted([1.0]), CountingEnv(), 1, dt=DT, **kwargs)
+    options = OptionExecutionWrapper(CountingEnv(), n_rbf=1, d_max=0.3, **kwargs)
+    (by_options,) = evaluate_discounted_return(Scripted([0.0, 1.0]), options, 1)
+    assert plain.discounted_return == pytest.approx(expected)
+    assert by_options.discounted_return == pytest.approx(expected)
+
+
+@pytest.mark.parametrize("scale", [0.0, -1.0, math.nan, math.inf])
+def test_a_scale_of_rewards_that_is_none(scale):
+    with pytest.raises(ValueError, match="reward_scale must be positive and finite"):
+        RewardRateWrapper(CountingEnv(), reward_scale=scale)
+
+
 def test_rewards_count_as_they_were_paid():
     env = VecNormalize(DummyVecEnv([CountingEnv]), norm_reward=True)
     (normalised,) = evaluate_discounted_return(Scripted([1.0]), env, 1, discount_rate=TAU, dt=DT)

@@ -867,6 +867,31 @@ def test_learning_curves_of_a_folder_and_of_a_csv_file(finished, tmp_path, capsy
         assert np.abs(band - bound).min() < 1e-3
 
 
+def test_collect_takes_records_of_before_and_refuses_a_folder(finished, tmp_path):
+    _, folder = finished
+    shutil.copytree(folder, tmp_path / "before")
+    for file in (tmp_path / "before").glob("*/record.json"):
+        record = json.loads(file.read_text())
+        del record["episode_return"], record["greedy_episode_return"]
+        file.write_text(json.dumps(record))
+    collect([tmp_path / "before"], tmp_path / "all.csv")
+    assert all(math.isnan(record["episode_return"]) for record in read_records(tmp_path / "all.csv"))
+    (tmp_path / "results").mkdir()
+    before = sorted(tmp_path.iterdir())
+    with pytest.raises(ValueError, match="results is a folder: name a CSV file"):
+        collect([folder], tmp_path / "results")
+    assert sorted(tmp_path.iterdir()) == before
+
+
+def test_a_run_in_whose_last_tenth_no_episode_ended_is_not_drawn(finished, tmp_path):
+    _, folder = finished
+    shutil.copytree(folder, tmp_path / "study")
+    file = next((tmp_path / "study").glob("*seed1/record.json"))
+    file.write_text(json.dumps({**json.loads(file.read_text()), "discounted_return": math.nan}))
+    plots.plot([tmp_path / "study"], tmp_path / "figures")
+    assert (tmp_path / "figures" / "frequency.png").exists()
+
+
 def test_collect_keeps_curves_of_other_folders(finished, tmp_path):
     _, folder = finished
     names = sorted(path.name for path in folder.iterdir())

@@ -74,6 +74,20 @@ def test_frames_are_those_of_the_video_whatever_the_rate(tmp_path, dt, last, fps
     assert duration_and_fps(env.files[0]) == (last // every + 1, pytest.approx(min(fps, 1 / dt)))
 
 
+def test_earlier_videos_stay(tmp_path):
+    pytest.importorskip("moviepy")
+    for number in range(2):
+        env = RecordEpisodes(Canvas(0.05, 3), tmp_path)
+        play(env)
+        assert env.files == [tmp_path / f"episode-{number}.mp4"]
+
+
+def test_without_moviepy_it_says_so_before_the_first_episode(tmp_path, monkeypatch):
+    monkeypatch.setitem(sys.modules, "moviepy.video.io.ImageSequenceClip", None)
+    with pytest.raises(ImportError, match=r"a video needs moviepy: .* pip install '.\[render\]'"):
+        RecordEpisodes(Canvas(), tmp_path)
+
+
 def test_an_episode_a_file_and_a_progress_bar(tmp_path, capsys):
     pytest.importorskip("moviepy")
     env = RecordEpisodes(Canvas(0.02, 30), tmp_path / "new", name="run", progress=True)

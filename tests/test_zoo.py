@@ -181,6 +181,25 @@ def test_two_trials_of_tuning(tmp_path):
     assert study.trials[0].params["d_max"] != study.trials[1].params["d_max"]
 
 
+def test_a_trial_whose_settings_make_no_model_is_pruned(tmp_path, capsys):
+    """Options of at most 0.1 to 2 s, and a rate that needs 1 s."""
+    flags = ["--env", "Pendulum-v1", "-f", str(tmp_path), "-n", "400", "--seed", "0", "--n-trials", "4"]
+    flags += ["--n-evaluations", "2", "--eval-episodes", "1", "--pruner", "none", "--no-optim-plots"]
+    main(["tune", *flags, *FEW_STEPS_PARAMS, "target_decision_rate:1.0"])
+    (report,) = (tmp_path / "ctco").glob("report_*.csv")
+    states = [trial["state"] for trial in csv.DictReader(report.open())]
+    assert set(states) == {"COMPLETE", "PRUNED"}
+    assert "has settings that make no model: target_decision_rate=1.0 Hz is out of reach" in capsys.readouterr().out
+
+
+def test_figars_repetitions_are_whole_steps_of_any_environment(tmp_path, models):
+    # 1 s, by default, is no whole number of 15 ms.
+    main(
+        ["train", "--algo", "figar_sac", "--env", "sb3_ctco/dog-stand-v0", "-f", str(tmp_path), *FEW_STEPS, *FEW_STEPS_PARAMS]
+    )
+    assert models[0].d_max == pytest.approx(67 * 0.015)
+
+
 @pytest.mark.parametrize(
     ("command", "arguments", "expected"),
     [

@@ -1,5 +1,6 @@
 """Give an agent of fixed rate its reward as an integral over time."""
 
+import math
 from typing import Any, SupportsFloat
 
 import gymnasium as gym
@@ -45,6 +46,8 @@ class RewardRateWrapper(gym.Wrapper, RecordConstructorArgs):
         RecordConstructorArgs.__init__(self, dt=dt, discount_rate=discount_rate, reward_scale=reward_scale)
         gym.Wrapper.__init__(self, env)
         dt = find_dt(env, required_by="RewardRateWrapper", given=dt)
+        if not 0 < reward_scale < math.inf:
+            raise ValueError(f"reward_scale must be positive and finite, not {reward_scale}")
         #: The clock: a step as an option of one step
         self.option_space = OptionSpace.make(1, d_max=dt, d_min=dt, dt=dt, discount_rate=discount_rate)
         self.reward_scale = reward_scale

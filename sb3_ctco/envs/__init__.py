@@ -59,5 +59,5 @@ def register_envs() -> None:
             gym.register(
                 env_id,
                 entry_point="sb3_ctco.envs.visual_reacher:VisualReacherEnv",
-                kwargs={"difficulty": difficulty},
+                kwargs={"difficulty": difficulty, "time_limit": 8.0},
             )

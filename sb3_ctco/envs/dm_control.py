@@ -144,11 +144,14 @@ class DMControlEnv(gym.Env[np.ndarray, np.ndarray]):
         :param actions: shape ``[n_steps, action_dim]``
         :param observe: numbers of steps after which to observe, too, increasing
         :return: last observation, the rewards of the steps that ran, terminated, truncated, info
+        :raises ValueError: if the actions have another shape
         :raises gymnasium.error.ResetNeeded: before the first reset and after the end of an episode
         :raises dm_control.rl.control.PhysicsError: if the simulation diverges; the episode is over then
         """
         if self._steps_left < 1:
             raise gym.error.ResetNeeded("call reset() first: the environment was not reset, or its episode has ended")
+        if actions.shape[1:] != self.action_space.shape:
+            raise ValueError(f"an action must have shape {self.action_space.shape}, not {actions.shape[1:]}")
         steps_left, self._steps_left = self._steps_left, 0
         actions = actions[: int(min(steps_left, len(actions)))]
         observe = [k for k in observe if k < len(actions)]

@@ -1,5 +1,6 @@
 """Figures of a study's records."""
 
+import math
 from collections import defaultdict
 from collections.abc import Sequence
 from pathlib import Path
@@ -70,7 +71,8 @@ def plot(
 
     # Text as text, and the same bytes for the same records.
     mpl.rcParams.update({"svg.fonttype": "none", "svg.hashsalt": "sb3-ctco"})
-    everything = _merged(sources)
+    # Where no episode ended in the last tenth, there is no return.
+    everything = [record for record in _merged(sources) if math.isfinite(record["discounted_return"])]
     records = chosen(with_equal_repeats(everything))
     if not records:
         raise ValueError(f"no record has an algorithm of {algorithms} and a setting of {settings}: {lines_of(everything)}")

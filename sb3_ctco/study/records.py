@@ -3,6 +3,7 @@
 import csv
 import io
 import json
+import math
 from collections.abc import Iterable, Iterator, Sequence
 from importlib import resources
 from pathlib import Path
@@ -62,7 +63,9 @@ def read_records(source: Path) -> list[Record]:
     :raises ValueError: if there are none, or the file lacks a column
     """
     if source.is_dir():
-        records = [json.loads(file.read_text(encoding="utf-8")) for file in sorted(source.glob(f"*/{RECORD}"))]
+        # Runs of before had no sums of rewards.
+        none = {"episode_return": math.nan, "greedy_episode_return": math.nan}
+        records = [{**none, **json.loads(file.read_text(encoding="utf-8"))} for file in sorted(source.glob(f"*/{RECORD}"))]
     elif source.is_file():
         records = _read_csv(source, COLUMNS)
     else:
@@ -94,8 +97,10 @@ def collect(folders: Sequence[Path], into: Path) -> tuple[int, int]:
     :param folders: of studies
     :param into: the file, made if there is none; see :func:`curves_file` for the other
     :return: the number of rows that are new, and of all rows
-    :raises ValueError: if a run is there already with other settings
+    :raises ValueError: if a run is there already with other settings, or ``into`` is a folder
     """
+    if into.is_dir():
+        raise ValueError(f"{into} is a folder: name a CSV file")
     merged = {key(record): record for record in read_records(into)} if into.exists() else {}
     curves = _by_run(read_curves(into))
     n_before = len(merged)

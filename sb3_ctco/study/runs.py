@@ -236,8 +236,11 @@ def git_commit() -> str:
 def write_whole(file: Path, text: str) -> None:
     """Write a file such that whoever reads it sees all of it, or what was there before."""
     part = file.with_name(f"{file.name}.{os.getpid()}")
-    part.write_text(text, encoding="utf-8")
-    os.replace(part, file)
+    try:
+        part.write_text(text, encoding="utf-8")
+        os.replace(part, file)
+    finally:
+        part.unlink(missing_ok=True)
 
 
 def _write_csv(file: Path, columns: Sequence[str], rows: Sequence[Sequence[float]]) -> None:
