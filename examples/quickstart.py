@@ -68,8 +68,8 @@ def main() -> None:
         tau=0.01,
         updates_per_second=20,
         d_max=0.5,
-        # More random than by default, −dim(ω) − 1: a sparse reward must be found before anything can be learned.
-        target_entropy=0.0,
+        # What a decision costs, ten times the default: where little is to be decided, few decisions do.
+        high_freq_penalty="relative_1.0",
         buffer_size=200_000,
         policy_kwargs={"net_arch": {"pi": [64, 64], "qf": [128, 128]}},
         seed=args.seed,
