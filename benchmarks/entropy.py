@@ -20,7 +20,7 @@ WINDOW = 10
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("folder", type=Path, help="the study's")
-    parser.add_argument("--figure", type=Path, default=Path(__file__).parents[1] / "docs" / "images" / "entropy.png")
+    parser.add_argument("--figure", type=Path, default=Path("entropy.png"))
     args = parser.parse_args()
     mpl.use("Agg")
     figure, axes = plt.subplots(2, 2, figsize=(10, 5.5), sharex=True, sharey="row", layout="constrained")
