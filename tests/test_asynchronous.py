@@ -38,6 +38,14 @@ from sb3_ctco.wrappers import RealTimeOptionWrapper, RealTimeWrapper
 pytestmark = pytest.mark.slow
 
 
+@pytest.fixture(autouse=True)
+def interrupts_interrupt():
+    """A shell's background job, which the tests may be, ignores SIGINT."""
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    yield
+    signal.signal(signal.SIGINT, before)
+
+
 class Point(gym.Env):
     """A point moved by its velocity; every command is kept."""
 
