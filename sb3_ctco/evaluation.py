@@ -12,7 +12,7 @@ from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.type_aliases import PolicyPredictor
 from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv, unwrap_vec_normalize
 
-from sb3_ctco.options import DEFAULT_DISCOUNT_RATE, PENDING, ActionBox, RewardUnit, discount, step_weight
+from sb3_ctco.options import DEFAULT_DISCOUNT_RATE, PENDING, ActionBox, RewardUnit, discount, integrated_reward
 
 
 def mean_absolute_jerk(actions: npt.ArrayLike, dt: float) -> float:
@@ -124,12 +124,15 @@ class _EpisodeTracker:
     dt: float | None
     reward_unit: RewardUnit
     running: list[EpisodeStatistics] = field(init=False)
+    #: What a reward of 1 in a primitive step of ``dt`` integrates to
+    weight: float = field(init=False)
     #: Primitive steps of the running episodes, and of those that ended last
     n_steps: list[int] = field(init=False)
     n_steps_of_last: list[int] = field(init=False)
 
     def __post_init__(self) -> None:
         self.running = [EpisodeStatistics() for _ in range(self.n_envs)]
+        self.weight = 0.0 if self.dt is None else integrated_reward(np.ones(1), self.dt, self.discount_rate, self.reward_unit)
         self.n_steps = [0] * self.n_envs
         self.n_steps_of_last = [0] * self.n_envs
 
@@ -145,8 +148,7 @@ class _EpisodeTracker:
             if "option" in info:
                 duration, integral = info["option"]["duration"], info["option"]["integrated_reward"]
             elif self.dt is not None:
-                weight = step_weight(self.dt, self.discount_rate) if self.reward_unit == "rate" else 1.0
-                duration, integral = self.dt, float(reward) * weight
+                duration, integral = self.dt, float(reward) * self.weight
             else:
                 raise ValueError("these steps are no options: pass dt, the environment's interaction period in seconds")
             episode = self.running[i]
@@ -218,8 +220,8 @@ def evaluate_discounted_return(
     :param reward_unit: where steps are no options, ``"rate"`` or ``"impulse"``, see
         :func:`~sb3_ctco.options.integrated_reward`; options have their environment's
     :return: one entry an episode
-    :raises ValueError: if the environment's options are discounted at another rate, or if smoothness is asked for where
-        actions are not in a Box with finite bounds
+    :raises ValueError: if the environment's options are discounted at another rate, for another ``reward_unit``, or if
+        smoothness is asked for where actions are not in a Box with finite bounds
     """
     if not isinstance(env, VecEnv):
         single = env
@@ -258,7 +260,8 @@ class DiscountedReturnCallback(BaseCallback):
     :param discount_rate: τ, in 1/s; by default the environment's where steps are options, and the paper's 0.404 elsewhere
     :param dt: interaction period in s, needed where the algorithm's steps are no options
     :param reward_unit: where they are none, ``"rate"`` or ``"impulse"``, see :func:`~sb3_ctco.options.integrated_reward`
-    :raises ValueError: when training starts, if the environment's options are discounted at another rate
+    :raises ValueError: when training starts, if the environment's options are discounted at another rate, or for another
+        ``reward_unit``
     """
 
     def __init__(self, discount_rate: float | None = None, dt: float | None = None, reward_unit: RewardUnit = "rate"):

@@ -145,7 +145,8 @@ class OptionExperimentManager(ExperimentManager):
             env = gym.make(self.env_name.gym_id, **(hyperparams.get("env_kwargs") or self.env_kwargs))
             arguments["dt"] = find_dt(env)
             env.close()
-        return [*wrappers, {WRAPPER: algorithm.wrapper_kwargs(arguments)}]
+        # Which a wrapper asks its own environment for, unless the file says it.
+        return [*wrappers, {WRAPPER: {**algorithm.wrapper_kwargs(arguments), "dt": hyperparams.get("dt")}}]
 
 
 def _plays_options(wrapper: Any) -> bool:

@@ -572,6 +572,12 @@ def test_one_update_by_hand(entropy_reference, random_walk_env):
     )
     set_temperature_of_d(model, 0.4)
     model.learn(200)
+
+    def cost(log_prob):
+        price = 0.2 * log_prob[:, :-1].sum(dim=1, keepdim=True) + 0.4 * log_prob[:, -1:]
+        # The density of three weights and d that are uniform over [−1, 1] is 1/2 each.
+        return price - (price.mean() if entropy_reference == "average" else (3 * 0.2 + 0.4) * math.log(0.5))
+
     # Let the targets differ from what they follow.
     with th.no_grad():
         for parameter in (*model.critic_target.parameters(), *model.actor_target.parameters()):
@@ -581,12 +587,6 @@ def test_one_update_by_hand(entropy_reference, random_walk_env):
     with th.no_grad():
         options, log_prob = model.actor.option_log_prob(batch.observations)
         next_options, next_log_prob = model.actor_target.option_log_prob(batch.next_observations)
-        total = lambda p: p.sum(dim=1, keepdim=True)  # noqa: E731
-        if entropy_reference == "uniform":
-            cost = lambda p: 0.2 * (total(p[:, :-1]) + 3 * math.log(2)) + 0.4 * (p[:, -1:] + math.log(2))  # noqa: E731
-        else:
-            price = lambda p: 0.2 * total(p[:, :-1]) + 0.4 * p[:, -1:]  # noqa: E731
-            cost = lambda p: price(p) - price(p).mean()  # noqa: E731
         next_q = model.critic_target(batch.next_observations, next_options).min(dim=0)[0]
         bootstrap = (1 - batch.dones) * batch.discounts * (next_q - cost(next_log_prob))
         target = batch.rewards - 0.05 + bootstrap

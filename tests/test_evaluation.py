@@ -78,6 +78,8 @@ def test_impulses_count_alike_by_steps_and_by_options():
     (by_options,) = evaluate_discounted_return(Scripted([0.0, 1.0]), options, 1)
     assert plain.discounted_return == pytest.approx(expected)
     assert by_options.discounted_return == pytest.approx(expected)
+    with pytest.raises(ValueError, match=r"the unit of rewards must be one of .*, not 'impulses'"):
+        evaluate_discounted_return(Scripted([1.0]), CountingEnv(), 1, dt=DT, reward_unit="impulses")
 
 
 @pytest.mark.parametrize("scale", [0.0, -1.0, math.nan, math.inf])

@@ -198,6 +198,8 @@ def test_figars_repetitions_are_whole_steps_of_any_environment(tmp_path, models)
         ["train", "--algo", "figar_sac", "--env", "sb3_ctco/dog-stand-v0", "-f", str(tmp_path), *FEW_STEPS, *FEW_STEPS_PARAMS]
     )
     assert models[0].d_max == pytest.approx(67 * 0.015)
+    saved = yaml.unsafe_load((tmp_path / "figar_sac/sb3_ctco-dog-stand-v0_1/sb3_ctco-dog-stand-v0/config.yml").read_text())
+    assert saved["env_wrapper"][0]["sb3_ctco.wrappers.OptionExecutionWrapper"]["dt"] is None
 
 
 @pytest.mark.parametrize(

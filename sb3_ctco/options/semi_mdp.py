@@ -93,7 +93,10 @@ def integrated_reward(rewards: FloatArray, dt: float, discount_rate: float, unit
     :param unit: ``"rate"`` for rewards that do not shrink with dt (dm_control, most of Gymnasium), ``"impulse"`` for
         rewards that are paid per event
     :return: R, in reward rate × s, or in reward for impulses
+    :raises ValueError: for another unit
     """
+    if unit not in REWARD_UNITS:
+        raise ValueError(f"the unit of rewards must be one of {REWARD_UNITS}, not {unit!r}")
     rewards = np.asarray(rewards, dtype=np.float64)
     total = float(rewards @ discounts_of_steps(len(rewards), dt, discount_rate))
     return total * step_weight(dt, discount_rate) if unit == "rate" else total
