@@ -50,6 +50,8 @@ TASKS = {
         1200.0,
         arguments={
             "d_max": 0.5,
+            "high_freq_penalty": 0.003,
+            "entropy_reference": "uniform",
             "batch_size": 100,
             "buffer_size": 200_000,
             "updates_per_second": 20,

@@ -1,6 +1,7 @@
 """Trained policies where the clock is not training's: other rates, ticks that come late, observations that are old.
 
-    sb3-ctco study run --preset quick --tasks cheetah ball_in_cup --rates 50 500 --settings tuned large
+    sb3-ctco study run --preset quick --rates 500 --algorithms ctco --settings tuned
+    sb3-ctco study run --preset opponents --rates 500 --settings 20ms --folder runs/study/quick
     python benchmarks/robustness.py runs/study/quick --output results/robustness
 
 Every model of CTCO, FiGAR-SAC and SAC (also with held actions) in a study's folder plays greedily. Options and held actions
