@@ -306,9 +306,7 @@ class OptionController:
                     "call reset() before their number changes"
                 )
         if now is not None:
-            now = float(now)
-            if not (math.isfinite(now) and (self._now is None or now >= self._now)):
-                raise ValueError(f"now must be finite and must not run backwards, and it is {now} s after {self._now} s")
+            now = self._checked(now)
             if self.safety is not None:
                 return self._guarded(observation, now, observed_at)
             seconds = self.dt if self._now is None else now - self._now
@@ -328,7 +326,30 @@ class OptionController:
         self._next += 1
         return self._rows[self._next - 1]
 
-    def _guarded(self, observation: Observation | None, now: float, observed_at: float | None) -> np.ndarray:
+    def stop(self, now: float) -> np.ndarray:
+        """The safe action in place of what the option says, within the limits, as at a tick by a clock.
+
+        Call it every tick until the machine rests. A tick with an observation after that decides anew, on from there.
+
+        :param now: the time of this tick by the caller's clock, in s
+        :return: shape ``[*action_shape]``, or ``[n, *action_shape]`` for n robots
+        :raises ValueError: without a ``safety``, after ticks without ``now``, or if ``now`` is not finite or runs backwards
+        """
+        if self.safety is None:
+            raise ValueError("safety=None has no safe action: pass OptionController(policy, safety=Safety(...))")
+        if self._executions and self._now is None:
+            raise ValueError("give now at each tick or at none; to change, call reset() in between")
+        return self._guarded(None, self._checked(now), None, "stopped")
+
+    def _checked(self, now: float) -> float:
+        now = float(now)
+        if not (math.isfinite(now) and (self._now is None or now >= self._now)):
+            raise ValueError(f"now must be finite and must not run backwards, and it is {now} s after {self._now} s")
+        return now
+
+    def _guarded(
+        self, observation: Observation | None, now: float, observed_at: float | None, reason: str | None = None
+    ) -> np.ndarray:
         assert self.safety is not None
         if observation is not None:
             self._observed_at = now if observed_at is None else observed_at
@@ -337,15 +358,17 @@ class OptionController:
         actions = low
         if self._first is not None and len(self._first) > 1:
             actions = np.broadcast_to(low, (len(self._first), *low.shape))
-        elif self._first is None and observation is not None and self._are_several(observation):
-            actions = np.broadcast_to(low, (len(_first_leaf(observation)), *low.shape))
-        reason = None if age <= self.safety.stale_after else "no fresh observation"
-        if age < -self.safety.stale_after:
+        if reason is None and not age <= self.safety.stale_after:
+            reason = "no fresh observation"
+        if reason is None and age < -self.safety.stale_after:
             reason = "observed_at is of another clock than now"
-        if reason is None:
-            try:
+        try:
+            if self._first is None and observation is not None and self._are_several(observation):
+                actions = np.broadcast_to(low, (len(_first_leaf(observation)), *low.shape))
+            if reason is None:
                 actions = self._at(observation, now)
-            except Exception as error:  # the policy's own, of any kind
+        except Exception as error:  # the policy's own, or by an observation that is none, of any kind
+            if reason is None:
                 reason = "the policy failed"
                 if not (self._guard is not None and self._guard.is_safe_action):
                     logger.error("the policy failed: %s: %s", type(error).__name__, error)
@@ -442,6 +465,10 @@ class OptionController:
 
     def _ask(self, observation: Observation, sent: list[np.ndarray], several: bool) -> np.ndarray:
         """Options for one or several observations, and the last two actions before each."""
+        for leaf in observation.values() if isinstance(observation, dict) else [observation]:
+            numbers = np.asarray(leaf)
+            if numbers.dtype.kind == "f" and not np.isfinite(numbers).all():  # which normalisation would hide
+                raise ValueError(f"the observation is not finite: {leaf}")
         return np.asarray(self.policy(self._as_seen(observation, sent, several)))
 
     def _as_seen(self, observation: Observation, sent: list[np.ndarray], several: bool) -> Observation:
@@ -560,7 +587,7 @@ def _algorithm_of(path: Path) -> "type[OptionOffPolicyAlgorithm]":
     # As Stable-Baselines3 does: the ending may be left out.
     file = path if path.exists() else path.with_name(f"{path.name}.zip")
     if not file.exists():
-        raise FileNotFoundError(f"{file} does not exist")
+        raise FileNotFoundError(f"{path} does not exist")
     try:
         with zipfile.ZipFile(file) as archive:
             settings = json.loads(archive.read("data"))

@@ -53,10 +53,13 @@ class Task:
         env = gym.make(self.env_id, disable_env_checker=True, **self.env_kwargs, **timing)
         dt = find_dt(env)
         if dt is None or not math.isclose(dt, 1.0 / rate, rel_tol=1e-3):
-            known = "does not tell its rate" if dt is None else f"runs at {1 / dt:g} Hz"
-            whole = dt is None or math.isclose(round(1 / dt) * dt, 1.0, rel_tol=1e-3)
+            if dt is None:
+                raise ValueError(
+                    f"task {self.name} does not tell its interaction period: give the environment an attribute dt, in s"
+                )
+            whole = math.isclose(round(1 / dt) * dt, 1.0, rel_tol=1e-3)
             hint = "its rates must be a list of that one" if whole else "a study needs a whole number of Hz"
-            raise ValueError(f"task {self.name} {known}, not at {rate} Hz: {hint}")
+            raise ValueError(f"task {self.name} runs at {1 / dt:g} Hz, not at {rate} Hz: {hint}")
         return env
 
     def seconds_of_episode(self, rate: int) -> float:

@@ -25,7 +25,7 @@ class Safety:
     :param stale_after: an observation that is older than this is not acted on, in s; ``math.inf`` to act on any
     :param safe_action: what is sent then, or when the policy fails: ``"zero"``, which stops a machine that is commanded by
         velocities, ``"hold"``, the last action once more (zero while none is known), which stops one that is commanded by
-        positions, or a function
+        positions, or a function. Of torques neither is safe: pass a function that brakes and holds the weight
     :param max_rate: the largest change of an action, in widths of its box a second; None for no limit
     :param max_slew: the largest change of that rate, in widths a second, a second; None for no limit. It slows down in time
         to come to rest at what is commanded, so it follows commands a little late that move faster than it stops in a period.
@@ -43,8 +43,12 @@ class Safety:
             value = getattr(self, name)
             if not (value is None and name != "stale_after") and not (isinstance(value, int | float) and value > 0):
                 raise ValueError(f"{name} must be a positive number, not {value!r}")
-        if not callable(self.safe_action) and self.safe_action not in ("hold", "zero"):
-            raise ValueError(f"safe_action must be 'hold', 'zero' or a function of the last action, not {self.safe_action!r}")
+        named = isinstance(self.safe_action, str) and self.safe_action in ("hold", "zero")
+        if not (named or callable(self.safe_action)):
+            raise ValueError(
+                f"safe_action must be 'hold', 'zero' or a function of the last action, not {self.safe_action!r}: for an "
+                "action that is always the same pass lambda last: action"
+            )
 
 
 class Guard:

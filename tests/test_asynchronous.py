@@ -1191,6 +1191,82 @@ def test_a_second_signal_does_not_break_off_the_safe_stop(tmp_path, caplog, firs
     assert len(records_of(tmp_path)) > 10
 
 
+class SignalsAt(BaseCallback):
+    def __init__(self, *numbers):
+        super().__init__()
+        self.numbers = numbers
+
+    def _on_step(self):
+        if self.num_timesteps == 10:
+            for number in self.numbers:
+                os.kill(os.getpid(), number)
+        return True
+
+
+@pytest.mark.parametrize("handler", [signal.SIG_IGN, lambda number, frame: None], ids=["ignored", "ends nothing"])
+def test_an_interrupt_that_ends_nothing_is_not_the_first_signal(tmp_path, handler):
+    signal.signal(signal.SIGINT, handler)
+    env, safe_stop = Point(), SlowStop()
+    trainer = AsynchronousTrainer(make_model(SAC, env), env, tmp_path, safe_stop=safe_stop)
+    with trainer, pytest.raises(SystemExit):
+        trainer.learn(5000, SignalsAt(signal.SIGINT, signal.SIGTERM))
+    assert safe_stop.is_done
+    assert len(env.commands) < 100
+
+
+def test_an_interrupt_that_would_end_the_process_makes_the_machine_safe(tmp_path):
+    signal.signal(signal.SIGINT, signal.SIG_DFL)
+    env, safe_stop = Point(), SlowStop()
+    trainer = AsynchronousTrainer(make_model(SAC, env), env, tmp_path, safe_stop=safe_stop)
+    with trainer, pytest.raises(KeyboardInterrupt):
+        trainer.learn(5000, SignalAt(signal.SIGINT))
+    assert safe_stop.is_done
+    assert signal.getsignal(signal.SIGINT) == signal.SIG_DFL
+
+
+class BrokenSensor(Point):
+    """Returns one observation, or one reward, that is no number."""
+
+    def __init__(self, obs=0.0, reward=0.0):
+        super().__init__()
+        self.fault = obs, reward
+
+    def step(self, action):
+        obs, reward, *rest = super().step(action)
+        if len(self.commands) == 60:
+            obs, reward = obs + np.float32(self.fault[0]), reward + self.fault[1]
+        return obs, reward, *rest
+
+
+@pytest.mark.parametrize("fault", [{"obs": np.nan}, {"reward": np.inf}], ids=["observation", "reward"])
+@pytest.mark.parametrize("algorithm", [SAC, CTCO])
+def test_what_is_not_finite_is_not_learned_from(tmp_path, algorithm, fault):
+    env = BrokenSensor(**fault)
+    with AsynchronousTrainer(make_model(algorithm, env), env, tmp_path) as trainer, pytest.raises(ValueError, match="finite"):
+        trainer.learn(1000)
+    assert env.commands[-1] == 0.0
+    env = Point()
+    with AsynchronousTrainer(make_model(algorithm, env), env, tmp_path, resume=True) as trainer:
+        trainer.learn(100)
+    for transition in records_of(tmp_path):
+        assert np.isfinite(transition.next_obs).all()
+        assert np.isfinite(transition.reward).all()
+
+
+def test_learning_that_diverges_leaves_the_checkpoint_as_it_was(tmp_path):
+    env = Point()
+    with AsynchronousTrainer(make_model(CTCO, env), env, tmp_path) as trainer:
+        trainer.learn(100)
+    before = (tmp_path / "model.zip").read_bytes()
+    model = make_model(CTCO, env, learning_rate=1e30)
+    with (
+        AsynchronousTrainer(model, env, tmp_path, resume=True) as trainer,
+        pytest.raises(LearnerError, match="learning diverged"),
+    ):
+        trainer.learn(5000)
+    assert (tmp_path / "model.zip").read_bytes() == before
+
+
 def test_a_third_signal_breaks_it_off(tmp_path):
     env, safe_stop = Point(), SlowStop(signal.SIGINT, signal.SIGINT)
     trainer = AsynchronousTrainer(make_model(SAC, env), env, tmp_path, safe_stop=safe_stop)

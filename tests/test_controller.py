@@ -16,6 +16,7 @@ from sb3_ctco import CTCO, DACPPO, FiGARSAC, OptionController, OptionExecutionWr
 from sb3_ctco.export import export_onnx
 from sb3_ctco.exported import OnnxPolicy, to_metadata
 from sb3_ctco.options import OptionSpace, RadialBasis
+from sb3_ctco.safety import Safety
 
 DT = 0.1
 SETTINGS = OptionSpace.make(n_rbf=1, d_max=0.4, d_min=DT, dt=DT, discount_rate=0.4, duration_scale="linear")
@@ -208,19 +209,20 @@ def test_reset_decides_anew_and_forgets_the_clock():
     assert len(policy.asked) == 2
 
 
+class DictEnv(gym.Env):
+    observation_space = spaces.Dict({"a": spaces.Box(-1, 1, (2,)), "b": spaces.Box(-1, 1, (3,))})
+    action_space = spaces.Box(-1, 1, (2,))
+    dt = 0.1
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        return self.observation_space.sample(), {}
+
+    def step(self, action):
+        return self.observation_space.sample(), 0.0, False, False, {}
+
+
 def test_dict_observations():
-    class DictEnv(gym.Env):
-        observation_space = spaces.Dict({"a": spaces.Box(-1, 1, (2,)), "b": spaces.Box(-1, 1, (3,))})
-        action_space = spaces.Box(-1, 1, (2,))
-        dt = 0.1
-
-        def reset(self, *, seed=None, options=None):
-            super().reset(seed=seed)
-            return self.observation_space.sample(), {}
-
-        def step(self, action):
-            return self.observation_space.sample(), 0.0, False, False, {}
-
     model = CTCO("MultiInputPolicy", DictEnv(), seed=0)
     controller = OptionController(model)
     one = model.observation_space.sample()
@@ -229,6 +231,25 @@ def test_dict_observations():
     two = {key: np.stack([value] * 2) for key, value in one.items()}
     for _ in range(30):
         assert controller(two).shape == (2, 2)
+
+
+GOOD = {"a": np.zeros(2, np.float32), "b": np.zeros(3, np.float32)}
+
+
+@pytest.mark.parametrize(
+    "wrong",
+    [{}, {"stamp": 1.0, **GOOD}, {**GOOD, "stamp": 1.0}, {"b": GOOD["b"]}, {"a": None, "b": GOOD["b"]}, GOOD["a"], "x"],
+    ids=["empty", "one more first", "one more", "one less", "none", "no dictionary", "text"],
+)
+@pytest.mark.parametrize("at_first", [True, False])
+def test_no_exception_reaches_a_loop_by_a_clock_from_an_observation_that_is_none(wrong, at_first):
+    controller = OptionController(
+        CTCO("MultiInputPolicy", DictEnv(), buffer_size=10), safety=Safety(max_rate=None, max_slew=None)
+    )
+    if not at_first:
+        controller(GOOD, now=0.0)
+    np.testing.assert_array_equal(controller(wrong, now=10.0), [0.0, 0.0])
+    assert controller.replaced["the policy failed"] == 1
 
 
 @pytest.mark.parametrize("suffix", ["", ".zip"])
@@ -245,6 +266,16 @@ def normalized_model() -> CTCO:
     model = CTCO("MlpPolicy", env, learning_starts=50, batch_size=16, seed=0)
     model.learn(200)
     return model
+
+
+@pytest.mark.parametrize("value", [np.nan, np.inf])
+def test_an_observation_that_is_not_finite_is_not_acted_on(value):
+    """Also where normalisation clips an infinite one."""
+    controller, wrong = OptionController(normalized_model()), np.array([0.3, value, 0.1], np.float32)
+    with pytest.raises(ValueError, match="the observation is not finite"):
+        controller(wrong)
+    controller(wrong, now=0.0)
+    assert controller.replaced == {"the policy failed": 1}
 
 
 def test_observations_are_normalised_as_in_training(tmp_path):
@@ -370,7 +401,7 @@ def test_files_of_models_without_options_are_refused(tmp_path):
     for name in ("dac_ppo", "sac.zip"):
         with pytest.raises(TypeError, match=f"{name[:3]}.*zip was not saved by CTCO or FiGARSAC.*model.predict"):
             OptionController(tmp_path / name)
-    with pytest.raises(FileNotFoundError, match=r"model\.zip does not exist"):
+    with pytest.raises(FileNotFoundError, match="model does not exist"):
         OptionController(tmp_path / "model")
     (tmp_path / "model.zip").write_bytes((tmp_path / "sac.zip").read_bytes()[:3000])
     with pytest.raises(ValueError, match=r"model\.zip is damaged or no model of Stable-Baselines3"):

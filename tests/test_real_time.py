@@ -1,6 +1,7 @@
 """The real-time wrapper, by a clock that the test turns."""
 
 import logging
+import threading
 import time
 
 import gymnasium as gym
@@ -291,3 +292,36 @@ def test_sub_options_leave_from_the_action_before_them(scripted_env, ahead, join
         again = env.option_space.plan(option, one[2:].astype(np.float64))[:, 0]
         assert np.abs(again - sent[first + 2 : end + 2]).max() == pytest.approx(residual, abs=2e-6)
         assert residual < {"continuous": 1e-5, "smooth": 0.2}[join]
+
+
+def test_a_reset_waits_for_a_step_that_was_given_up():
+    """Or the rest of the old option would be played beside the new episode."""
+    log, hangs, goes_on = [], threading.Event(), threading.Event()
+
+    class Machine(Simulation):
+        def reset(self, *, seed=None, options=None):
+            log.append("reset")
+            return super().reset(seed=seed)
+
+        def step(self, action):
+            log.append(round(float(action[0]), 2))
+            if len(log) == 9:  # the second step of the rest
+                hangs.set()
+                goes_on.wait(30.0)
+            return super().step(action)
+
+    env = RealTimeOptionWrapper(Machine(FakeClock()), decide_ahead=1.0, background=True, n_rbf=1, d_max=2.5)
+    env.reset()
+    env.step([0.7, 1.0])
+    assert hangs.wait(30.0)
+    assert not env.abandon(0.05)
+    log.append("given up")
+    threading.Timer(0.2, goes_on.set).start()
+    env.reset()
+    goes_on.wait(30.0)
+    time.sleep(0.1)
+    env.step([-0.7, 0.0])
+    env.close()
+    after = log[log.index("given up") + 1 :]
+    assert after[0] == "reset"
+    assert set(after[1:]) == {-0.7}

@@ -160,6 +160,39 @@ def test_no_fresh_observation(caplog):
     assert caplog.text.count("no fresh observation") == 1
 
 
+@pytest.mark.parametrize("n", [None, 3])
+def test_a_stop_takes_the_option_s_place_within_the_limits(n):
+    policy, controller = make_controller(max_rate=10.0)
+    obs = np.zeros(3) if n is None else np.zeros((n, 3))
+    np.testing.assert_array_equal(controller(obs, now=0.0), HALF if n is None else [HALF] * n)
+    # By 10 widths a second, which are 2 and 4, at most
+    for k, expected in enumerate([[0.1, 2.2], [0.0, 1.4], [0.0, 0.6], [0.0, 0.0]]):
+        sent = controller.stop(now=0.02 * (k + 1))
+        np.testing.assert_allclose(sent, expected if n is None else [expected] * n, atol=1e-6)
+    assert controller.replaced == {"stopped": 4}
+    assert len(policy.asked) == 1
+    np.testing.assert_allclose(controller(obs, now=0.1), np.broadcast_to([0.4, 0.8], sent.shape), atol=1e-6)
+    assert len(policy.asked) == 2
+
+
+def test_a_stop_before_the_first_tick_sends_the_safe_action():
+    _, controller = make_controller()
+    np.testing.assert_array_equal(controller.stop(now=0.0), [0, 0])
+
+
+def test_a_stop_needs_a_clock_and_a_safe_action():
+    _, controller = make_controller()
+    controller(np.zeros(3))
+    with pytest.raises(ValueError, match="give now at each tick or at none"):
+        controller.stop(now=0.1)
+    controller.reset()
+    controller.stop(now=0.1)
+    with pytest.raises(ValueError, match="must not run backwards"):
+        controller.stop(now=0.0)
+    with pytest.raises(ValueError, match="safety=None has no safe action"):
+        OptionController(Policy(), safety=None).stop(now=0.0)
+
+
 def test_an_option_that_runs_out_without_a_new_observation_holds_its_last_action():
     policy, controller = make_controller(stale_after=1.0)
     controller(np.zeros(3), now=0.0)

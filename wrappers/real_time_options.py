@@ -182,9 +182,11 @@ class RealTimeOptionWrapper(OptionExecutionWrapper):
         self._abandoned = True
         self._play = None
         self._rest = None
-        playing, self._playing_rest = self._playing_rest, None
         # Whatever it raised is of no interest any more.
-        return playing is None or not wait([playing], timeout).not_done
+        has_ended = self._playing_rest is None or not wait([self._playing_rest], timeout).not_done
+        if has_ended:
+            self._playing_rest = None
+        return has_ended
 
     def close(self) -> None:
         """Stop playing and close the environment."""

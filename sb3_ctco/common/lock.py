@@ -27,7 +27,7 @@ def lock(path: Path, patience: float = 0.5, name: str = LOCK) -> Iterator[bool]:
             try:
                 _flock(file)
             except OSError as error:
-                if error.errno not in (errno.EAGAIN, errno.EACCES, errno.EDEADLOCK):
+                if error.errno not in (errno.EAGAIN, errno.EACCES, errno.EDEADLK):
                     raise
                 if time.monotonic() >= end:
                     yield False

@@ -45,9 +45,16 @@ def with_last_action(space: spaces.Space, observation: Any, action: FloatArray) 
     :param space: of :func:`with_last_action_space`
     :param observation: the environment's, ``[*shape]`` or ``[n, *shape]``, or a dictionary of such
     :param action: what an option leaves from, ``[n_numbers]`` or ``[n, n_numbers]``
+    :raises ValueError: if a vector is of another length than the environment's
     """
     action = action.clip(-1.0, 1.0)  # rounding
     if isinstance(space, spaces.Box):
+        expected = space.shape[0] - action.shape[-1]
+        if np.shape(observation)[-1:] != (expected,):
+            raise ValueError(
+                f"the environment's observations have the shape {(expected,)}, without the last action, which is added here; "
+                f"this one has the shape {np.shape(observation)}"
+            )
         return np.concatenate([observation, action.astype(space.dtype)], axis=-1)
     parts = observation if isinstance(observation, dict) else {OBSERVATION: observation}
     return {**parts, LAST_ACTION: action.astype(np.float32)}

@@ -22,7 +22,7 @@ from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from sb3_ctco.common.lock import lock
 from sb3_ctco.options import SubOptions
 from sb3_ctco.realtime.journal import Arrays, JournalError, JournalReader
-from sb3_ctco.realtime.weights import SharedWeights
+from sb3_ctco.realtime.weights import SharedWeights, is_finite
 
 logger = logging.getLogger(__name__)
 
@@ -183,6 +183,10 @@ class _Learner:
                 model._update_current_progress_remaining(model.num_timesteps, settings.total_timesteps)
                 model.train(gradient_steps=n_updates, batch_size=model.batch_size)
                 self.num_updates += n_updates
+                if not is_finite(model.policy):
+                    raise RuntimeError(
+                        "learning diverged, weights are not finite: go on from the checkpoint with a smaller learning_rate"
+                    )
                 self.weights.publish(acting_module(model))
                 seconds_per_update = max(1e-5, (time.monotonic() - now) / n_updates)
             else:
@@ -202,7 +206,9 @@ class _Learner:
             pass
 
     def save(self) -> None:
-        """Write a checkpoint, in one move."""
+        """Write a checkpoint, in one move; nothing in place of a good one if learning diverged."""
+        if not is_finite(self.model.policy):
+            return
         unfinished = self.settings.folder / "model.unfinished.zip"
         try:
             self.model.save(unfinished)

@@ -58,7 +58,7 @@ from sb3_ctco.wrappers import (
     TakeOver,
     TakeOverWrapper,
 )
-from sb3_ctco.wrappers.checks import reset_env
+from sb3_ctco.wrappers.checks import check_observation, reset_env
 
 logger = logging.getLogger(__name__)
 
@@ -629,7 +629,12 @@ class _Supervisor(gym.Wrapper):
         if self.check is not None:
             self.check()
         self.has_commanded = self.has_stepped = True
-        return self.env.step(action)
+        obs, reward, terminated, truncated, info = self.env.step(action)
+        # What is in the journal is learned from, again and again.
+        check_observation(self.env, obs)
+        if not math.isfinite(reward):
+            raise ValueError(f"the environment {self.env} returned the reward {reward}, which is not finite")
+        return obs, reward, terminated, truncated, info
 
 
 class _JournalBuffer:
@@ -796,7 +801,8 @@ class _DecidedEnv(VecEnvWrapper):
 def _one_signal() -> Iterator[Callable[[], None]]:
     """The first SIGTERM ends the block by SystemExit, the first SIGINT as it does outside, so that what follows is done.
 
-    A second one does not break that off; the third does. It yields a function after which also the first does not.
+    A second one does not break that off; the third does. A SIGINT that is ignored outside, or that ends nothing there, counts
+    as none. It yields a function after which also the first does not.
     """
     n_signals = 0
 
@@ -808,17 +814,26 @@ def _one_signal() -> Iterator[Callable[[], None]]:
         yield none_more
         return
 
+    interrupt: Any = signal.getsignal(signal.SIGINT)
+    if interrupt == signal.SIG_DFL:  # which would leave the machine as it is
+        interrupt = signal.default_int_handler
+
     def handle(number: int, frame: Any) -> None:
         nonlocal n_signals
-        n_signals += 1
-        if n_signals == 2:
+        if n_signals == 1:
+            n_signals = 2
             logger.warning("%s: the machine is being made safe; once more breaks that off", signal.Signals(number).name)
-        elif number == signal.SIGTERM:
-            raise SystemExit(128 + number)
-        elif callable(before[number]):
-            before[number](number, frame)
+            return
+        try:
+            if number == signal.SIGTERM:
+                raise SystemExit(128 + number)
+            interrupt(number, frame)
+        except BaseException:
+            n_signals += 1
+            raise
 
-    before: dict[int, Any] = {number: signal.signal(number, handle) for number in (signal.SIGTERM, signal.SIGINT)}
+    handled = [signal.SIGTERM, signal.SIGINT] if callable(interrupt) else [signal.SIGTERM]
+    before: dict[int, Any] = {number: signal.signal(number, handle) for number in handled}
     try:
         yield none_more
     finally:

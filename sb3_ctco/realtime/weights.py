@@ -76,6 +76,11 @@ class SharedWeights:
         return time.monotonic() - self._seen_published_at
 
 
+def is_finite(module: nn.Module) -> bool:
+    """Whether all weights of a module are numbers."""
+    return all(bool(th.isfinite(weights).all()) for weights in module.parameters())
+
+
 def _bytes_of(tensor: th.Tensor) -> np.ndarray:
     return tensor.detach().cpu().contiguous().numpy().reshape(-1).view(np.uint8)
 
