@@ -220,9 +220,12 @@ def evaluate_discounted_return(
     :param reward_unit: where steps are no options, ``"rate"`` or ``"impulse"``, see
         :func:`~sb3_ctco.options.integrated_reward`; options have their environment's
     :return: one entry an episode
-    :raises ValueError: if the environment's options are discounted at another rate, for another ``reward_unit``, or if
-        smoothness is asked for where actions are not in a Box with finite bounds
+    :raises ValueError: if ``n_eval_episodes`` is negative, the environment's options are discounted at another rate, for an
+        unknown ``reward_unit`` where steps are no options, or if smoothness is asked for where actions are not in a Box with
+        finite bounds
     """
+    if n_eval_episodes < 0:
+        raise ValueError(f"n_eval_episodes must be at least 0, not {n_eval_episodes}")
     if not isinstance(env, VecEnv):
         single = env
         env = DummyVecEnv([lambda: single])

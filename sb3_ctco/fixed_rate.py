@@ -101,7 +101,7 @@ class QuickSACPolicy(SACPolicy):
         if not deterministic:
             log_std = _affine(self.actor.log_std, x).clip(LOG_STD_MIN, LOG_STD_MAX)
             gaussian += np.exp(log_std) * th.randn(gaussian.shape).numpy()
-        actions = self.unscale_action(np.tanh(gaussian))
+        actions = self.unscale_action(np.tanh(gaussian).reshape(-1, *self.action_space.shape))  # type: ignore[misc]
         return actions if observation.ndim > n_axes else actions[0], state
 
 
@@ -163,17 +163,19 @@ class FixedRateSAC(SAC):
                 "the environment must be wrapped as sac_at_rate wraps it: call set_env with one bare environment, or make a "
                 "VecEnv with wrapper_class=RewardRateWrapper; a new model is made by sac_at_rate"
             )
-        (space, *_), scale = env.get_attr("option_space"), None
-        if env.has_attr("reward_scale"):
-            (scale, *_) = env.get_attr("reward_scale")
-        if self.option_space is not None:
-            differences = self.option_space.differences(space)
-            if scale is not None and self.reward_scale is not None and not np.isclose(scale, self.reward_scale, rtol=1e-6):
-                differences["reward_scale"] = self.reward_scale, scale
+        spaces = env.get_attr("option_space")
+        scales = env.get_attr("reward_scale") if env.has_attr("reward_scale") else [None] * len(spaces)
+        expected = self.option_space or spaces[0]
+        expected_scale = scales[0] if self.reward_scale is None else self.reward_scale
+        for space, scale in zip(spaces, scales, strict=True):
+            differences = expected.differences(space)
+            if scale is not None and expected_scale is not None and not np.isclose(scale, expected_scale, rtol=1e-6):
+                differences["reward_scale"] = expected_scale, scale
             if differences:
                 found = ", ".join(f"{name}={there} in place of {here}" for name, (here, there) in differences.items())
-                raise ValueError(f"the environment is another one than this model learned in: it has {found}")
-        return space, scale
+                other = "the first one of the VecEnv" if self.option_space is None else "that which this model learned in"
+                raise ValueError(f"an environment is another one than {other}: it has {found}")
+        return spaces[0], scales[0]
 
     @classmethod
     def load(  # type: ignore[override]
@@ -303,8 +305,8 @@ def sac_at_rate(
         >>> round(model.gamma, 6), model.train_freq.frequency, model.gradient_steps, model.learning_starts
         (0.98, 4, 1, 1200)
 
-    :param env: the environment to learn from: a Gymnasium id, a bare environment, one in a ``RewardRateWrapper``, or a
-        VecEnv of such (not with ``hold_seconds``). A ``RewardRateWrapper`` of yours has the unit that its ``reward_scale``
+    :param env: the environment to learn from: a Gymnasium id, a bare environment; without ``hold_seconds`` also one in a
+        ``RewardRateWrapper``, or a VecEnv of such. A ``RewardRateWrapper`` of yours has the unit that its ``reward_scale``
         says; that of a bare environment is given 1/``step_weight(gamma_dt, discount_rate)``
     :param dt: the environment's interaction period, in s
     :param updates_per_second: updates per second of task time, summed over the environments of a VecEnv

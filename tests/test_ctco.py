@@ -8,16 +8,18 @@ import torch as th
 from gymnasium import spaces
 from stable_baselines3 import SAC
 from stable_baselines3.common.buffers import ReplayBuffer
+from stable_baselines3.common.callbacks import EvalCallback
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.noise import NormalActionNoise
 from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecNormalize
 from torch.distributions import Normal
 
-from sb3_ctco import CTCO, DictOptionReplayBuffer, OptionExecutionWrapper, OptionReplayBuffer
+from sb3_ctco import CTCO, DictOptionReplayBuffer, FiGARSAC, OptionExecutionWrapper, OptionReplayBuffer
 from sb3_ctco.common.losses import actor_loss, critic_loss, critic_target, log_reference_density
 from sb3_ctco.common.policies import EnsembleLinear, squashed_log_prob
 from sb3_ctco.ctco.policies import CTCOPolicy
 from sb3_ctco.options import DEFAULT_DISCOUNT_RATE, discount_rate_from_gamma, step_weight
+from sb3_ctco.safety import Safety
 from sb3_ctco.wrappers import TakeOverWrapper
 
 # Without sub-options, so that rows of the buffer are the decisions in their order.
@@ -1056,3 +1058,48 @@ def test_training_mode_is_that_of_the_networks() -> None:
         assert not model.actor_target.training
     model.predict(np.zeros(3))
     assert not model.actor.training
+
+
+# --- at the edges
+
+
+@pytest.mark.parametrize("number", [np.float32, np.float64, np.int64])
+def test_numbers_may_be_numpys(number, random_walk_env):
+    """As they come of ``np.prod``, ``np.linspace`` or a search for hyperparameters."""
+    short = {"learning_starts": 5, "batch_size": 8, "policy_kwargs": {"net_arch": [8]}}
+    model = CTCO(
+        "MlpPolicy",
+        random_walk_env(),
+        high_freq_penalty=number(1),
+        target_decision_rate=number(4),
+        target_entropy=-number(2),
+        replay_buffer_kwargs={"reward_scale": number(2)},
+        **short,
+    )
+    assert model.learn(30)._n_updates > 0
+    entropies = {"target_entropy": -number(1), "duration_target_entropy": number(1)}
+    assert FiGARSAC("MlpPolicy", random_walk_env(), **entropies, **short).learn(20)._n_updates > 0
+    Safety(max_rate=number(3))
+
+
+@pytest.mark.parametrize("value", [math.nan, math.inf])
+def test_what_is_learned_with_is_finite(value, random_walk_env):
+    with pytest.raises(ValueError, match="target_entropy must be a number"):
+        CTCO("MlpPolicy", random_walk_env(), target_entropy=value)
+    model = CTCO("MlpPolicy", random_walk_env(), learning_starts=5, high_freq_penalty=lambda remaining: value)
+    with pytest.raises(ValueError, match=f"high_freq_penalty returned {value}"):
+        model.learn(30)
+
+
+def test_an_eval_callback_within_another(random_walk_env):
+    inner = EvalCallback(random_walk_env(), n_eval_episodes=1, eval_freq=1)
+    outer = EvalCallback(random_walk_env(), n_eval_episodes=1, callback_on_new_best=inner, eval_freq=20)
+    CTCO("MlpPolicy", random_walk_env(), learning_starts=999).learn(60, callback=outer)
+    assert np.isfinite(inner.last_mean_reward)
+
+
+def test_stock_sac_with_the_option_buffer_refuses_rewards_that_are_normalised(random_walk_env):
+    env = VecNormalize(DummyVecEnv([lambda: OptionExecutionWrapper(random_walk_env())]))
+    model = SAC("MlpPolicy", env, replay_buffer_class=OptionReplayBuffer, learning_starts=10, batch_size=8)
+    with pytest.raises(ValueError, match="pass norm_reward=False"):
+        model.learn(100)

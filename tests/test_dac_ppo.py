@@ -603,3 +603,9 @@ def test_how_often_to_update_may_be_changed_while_loading(scripted_env, tmp_path
     loaded.save(tmp_path / "model")
     loaded = DACPPO.load(tmp_path / "model", updates_per_second=4.0)
     assert (loaded.n_epochs, loaded.updates_per_second) == (None, 4.0)
+
+
+@pytest.mark.parametrize("dt", [0.0, -0.1, math.inf])
+def test_an_interaction_period_that_is_none(scripted_env, dt):
+    with pytest.raises(ValueError, match=f"dt must be a positive number of seconds, not {dt}"):
+        DACPPO("MlpPolicy", scripted_env(dt=dt))

@@ -303,3 +303,8 @@ def test_an_episode_that_a_training_was_stopped_in_is_recorded_whole_or_not_at_a
     model._last_obs = None  # as after an error: the next training begins with a reset
     model.learn(25, callback, reset_num_timesteps=False)
     assert [episode.seconds for episode in callback.episodes] == pytest.approx([1.0, 1.0])
+
+
+def test_less_than_no_episodes_are_refused(scripted_env):
+    with pytest.raises(ValueError, match="n_eval_episodes must be at least 0, not -1"):
+        evaluate_discounted_return(None, scripted_env(), n_eval_episodes=-1, dt=0.1)

@@ -15,8 +15,10 @@ from stable_baselines3.common.callbacks import BaseCallback, EvalCallback
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.evaluation import evaluate_policy
 from stable_baselines3.common.monitor import Monitor
+from stable_baselines3.common.vec_env import DummyVecEnv
+from stable_baselines3.sac.policies import MlpPolicy
 
-from sb3_ctco import OptionExecutionWrapper, RewardRateWrapper, sac_at_rate
+from sb3_ctco import CTCO, OptionExecutionWrapper, RewardRateWrapper, sac_at_rate
 from sb3_ctco import fixed_rate as module
 from sb3_ctco.evaluation import DiscountedReturnCallback, evaluate_discounted_return
 from sb3_ctco.fixed_rate import FixedRateSAC, QuickSACPolicy, hold_actions, update_schedule
@@ -520,3 +522,35 @@ def test_progress_ends_at_zero_also_where_the_last_decision_ends_later(scripted_
     )
     assert model.learn(22).num_timesteps == 25
     assert min(seen) == 0.0
+
+
+def test_rewards_are_integrated_once(scripted_env):
+    """Options around a wrapper that integrates each step's reward would do it once more."""
+    env = RewardRateWrapper(scripted_env(truncate_at=20), dt=0.1)
+    for make in (lambda: sac_at_rate(env, dt=0.1, hold_seconds=0.2), lambda: CTCO("MlpPolicy", env)):
+        with pytest.raises(ValueError, match="RewardRateWrapper, which integrates rewards over a step"):
+            make()
+    OptionExecutionWrapper(env, reward_unit="impulse")
+
+
+@pytest.mark.parametrize("other", [{"reward_scale": 7.0}, {"dt": 0.2}])
+def test_each_environment_of_several_has_the_same_clock_and_unit(scripted_env, other):
+    settings = [{"dt": 0.1, "reward_scale": 1.0}, {"dt": 0.1, "reward_scale": 1.0, **other}]
+    make = [lambda kwargs=kwargs: RewardRateWrapper(scripted_env(dt=kwargs["dt"]), **kwargs) for kwargs in settings]
+    with pytest.raises(ValueError, match="another one than the first one of the VecEnv"):
+        FixedRateSAC("MlpPolicy", DummyVecEnv(make), **SMALL)
+    model = FixedRateSAC("MlpPolicy", DummyVecEnv(make[:1] * 2), **SMALL)
+    with pytest.raises(ValueError, match="another one than that which this model learned in"):
+        model.set_env(DummyVecEnv(make))
+
+
+@pytest.mark.parametrize("shape", [(3,), (1, 3), (2, 2)])
+def test_the_quick_policy_acts_in_the_shape_of_the_actions(scripted_env, shape):
+    model = sac_at_rate(scripted_env(action_space=spaces.Box(-1.0, 1.0, shape)), dt=0.1, policy=QuickSACPolicy, **SMALL)
+    slow = MlpPolicy(model.observation_space, model.action_space, lambda _: 1e-3, net_arch=[8])
+    slow.load_state_dict(model.policy.state_dict())
+    for obs in (np.ones(2, np.float32), np.ones((5, 2), np.float32)):
+        expected, _ = slow.predict(obs, deterministic=True)
+        action, _ = model.predict(obs, deterministic=True)
+        assert action.shape == expected.shape
+        np.testing.assert_allclose(action, expected, atol=1e-6)

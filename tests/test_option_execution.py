@@ -605,3 +605,14 @@ def test_rewards_may_come_in_the_same_array_each_time(scripted_env):
     env = wrap(scripted_env(rewards=rewards), reward="sum")
     env.reset(seed=0)
     assert env.step([0.0, 1.0])[1] == 55.0
+
+
+def test_a_fault_of_the_environments_own_says_what_it_is(scripted_env):
+    class Faulty(type(scripted_env())):
+        def step(self, action):
+            _, _ = [1]
+
+    env = OptionExecutionWrapper(Faulty())
+    env.reset()
+    with pytest.raises(ValueError, match=r"^not enough values to unpack \(expected 2, got 1\)$"):
+        env.step(np.zeros(4))

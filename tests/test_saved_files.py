@@ -141,3 +141,21 @@ def test_what_logs_tell_of_is_no_part_of_a_file(tmp_path, random_walk_env):
     assert len(model._durations_since_log) > 0
     model.save(tmp_path / "model")
     assert len(CTCO.load(tmp_path / "model")._durations_since_log) == 0
+
+
+def test_two_ways_to_say_how_often_to_update_are_refused_by_load_too(tmp_path, random_walk_env):
+    CTCO("MlpPolicy", random_walk_env(), updates_per_second=5.0, buffer_size=10).save(tmp_path / "model")
+    with pytest.raises(ValueError, match=r"updates_per_second=7.0 and gradient_steps=3 both say how often to update"):
+        CTCO.load(tmp_path / "model", gradient_steps=3, updates_per_second=7.0)
+    assert CTCO.load(tmp_path / "model", gradient_steps=3).updates_per_second is None
+
+
+def test_repetitions_are_of_the_files_step(tmp_path, scripted_env):
+    FiGARSAC("MlpPolicy", scripted_env(dt=0.1, truncate_at=30), n_repetitions=5, buffer_size=10).save(tmp_path / "model")
+    with pytest.raises(ValueError, match=r"dt=0.05, FiGARSAC has dt=0.1.*To evaluate at another rate.*wrap_env\(env\)"):
+        FiGARSAC.load(tmp_path / "model", env=scripted_env(dt=0.05))
+    with pytest.raises(ValueError, match="dt"):
+        FiGARSAC.load(tmp_path / "model", env=scripted_env(dt=0.05), dt=0.05)
+    wrapped = FiGARSAC.load(tmp_path / "model").wrap_env(scripted_env(dt=0.05))
+    wrapped.reset()
+    assert wrapped.step(np.array([0.0, 1.0]))[4]["option"]["n_steps"] == 10

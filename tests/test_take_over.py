@@ -118,3 +118,11 @@ def test_what_a_machine_says_was_sent_is_copied(scripted_env):
         env.step(np.zeros(1, np.float32))
     env.hand_over()
     np.testing.assert_allclose(recorded[0].actions[:, 0], [0.0, 0.1, 0.2, 0.3], atol=1e-6)
+
+
+def test_an_action_that_is_not_finite_is_not_sent(scripted_env):
+    inner = scripted_env()
+    env = TakeOverWrapper(inner, lambda obs: [np.nan], lambda trajectory: None)
+    with pytest.raises(ValueError, match=r"take_over returned .*, which is not finite"):
+        env.reset()
+    assert not inner.actions

@@ -3,8 +3,10 @@
 import contextlib
 import itertools
 import math
+import traceback
 from collections.abc import Sequence
 from copy import deepcopy
+from pathlib import Path
 from typing import Any, Literal, SupportsFloat
 
 import gymnasium as gym
@@ -40,6 +42,7 @@ from sb3_ctco.options import (
 )
 from sb3_ctco.wrappers.checks import check_observation, is_finite, reset_env
 from sb3_ctco.wrappers.real_time import refuse_other_actions
+from sb3_ctco.wrappers.reward_rate import RewardRateWrapper
 from sb3_ctco.wrappers.step_sequence import SequenceResult, StepSequence, find_step_sequence
 from sb3_ctco.wrappers.timing import find_dt
 
@@ -142,6 +145,11 @@ class OptionExecutionWrapper(gym.Wrapper, RecordConstructorArgs):
 
         if unwrap_wrapper(env, OptionExecutionWrapper) is not None:
             raise ValueError(f"the environment {env} plays options already: wrap it once")
+        if reward_unit == "rate" and unwrap_wrapper(env, RewardRateWrapper) is not None:
+            raise ValueError(
+                f"the environment {env} has a RewardRateWrapper, which integrates rewards over a step, and options integrate "
+                "them once more: wrap the environment inside it, or pass reward_unit='impulse'"
+            )
         if join != "free":
             refuse_other_actions(env, f"join={join!r}")
         space = env.action_space
@@ -332,7 +340,10 @@ class OptionExecutionWrapper(gym.Wrapper, RecordConstructorArgs):
         try:
             obs, rewards, terminated, truncated, info = play(actions, observe) if observe else play(actions)
         except (TypeError, ValueError) as error:
-            if "unpack" not in str(error):
+            *_, (innermost, _) = traceback.walk_tb(error.__traceback__)
+            # What fails within the environment's own step says for itself what it is.
+            is_ours = {"gymnasium", "stable_baselines3", "wrappers"} & set(Path(innermost.f_code.co_filename).parts)
+            if "unpack" not in str(error) or not is_ours:
                 raise
             raise TypeError(
                 f"{error}, from the environment {self.env}: step must return observation, reward, terminated, truncated and "

@@ -96,5 +96,8 @@ class TakeOverWrapper(gym.Wrapper, RecordConstructorArgs):
         self._next_action = None
         if given is not None:
             space: Any = self.env.action_space
-            self._next_action = np.asarray(given, dtype=space.dtype).reshape(space.shape).clip(space.low, space.high)
+            action = np.asarray(given, dtype=space.dtype).reshape(space.shape)
+            if not np.isfinite(action).all():
+                raise ValueError(f"take_over returned {given}, which is not finite: return None to hand over")
+            self._next_action = action.clip(space.low, space.high)
             self._last_obs = deepcopy(obs)

@@ -2,6 +2,7 @@
 
 import dataclasses
 import math
+from numbers import Real
 from typing import Any, Literal, NamedTuple
 
 import numpy as np
@@ -72,7 +73,7 @@ class _OptionStorage(ReplayBuffer):
     ):
         if not 0.0 <= demonstration_fraction <= 1.0:
             raise ValueError(f"demonstration_fraction must be a part of each batch, in [0, 1], not {demonstration_fraction}")
-        if reward_scale != "auto" and not (isinstance(reward_scale, int | float) and 0 < reward_scale < math.inf):
+        if reward_scale != "auto" and not (isinstance(reward_scale, Real) and 0 < reward_scale < math.inf):
             raise ValueError(f"reward_scale must be a positive number or 'auto', not {reward_scale!r}")
         if optimize_memory_usage:
             raise ValueError(
@@ -90,7 +91,7 @@ class _OptionStorage(ReplayBuffer):
             handle_timeout_termination=handle_timeout_termination,
         )
         self.discount_rate = float(discount_rate)
-        self.reward_scale = reward_scale
+        self.reward_scale: float | Literal["auto"] = "auto" if reward_scale == "auto" else float(reward_scale)
         self.demonstration_fraction = float(demonstration_fraction)
         self.option_space = option_space
         self.primitive_action_space = primitive_action_space
@@ -350,6 +351,11 @@ class _OptionStorage(ReplayBuffer):
         self.timeouts[rows, 0] = sub_options.truncated & ~sub_options.terminated & self.handle_timeout_termination
 
     def _sample_fields(self, batch_inds: np.ndarray, env: VecNormalize | None) -> dict[str, Any]:
+        if env is not None and env.norm_reward:
+            raise ValueError(
+                "VecNormalize counts its returns per decision, whatever time a decision takes: pass norm_reward=False"
+            )
+
         # ReplayBuffer._get_samples of Stable-Baselines3 2.9 has no place for further fields, so it is written anew.
         def rows(stored: np.ndarray) -> np.ndarray:
             return stored[:, 0].take(batch_inds, axis=0)  # makes the copy that to_torch would make again

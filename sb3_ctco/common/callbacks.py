@@ -25,6 +25,7 @@ def eval_callbacks(callback: BaseCallback | None) -> Iterator[EvalCallback]:
     """The callbacks that evaluate, also those that others contain."""
     if isinstance(callback, EvalCallback):
         yield callback
+        yield from eval_callbacks(callback.callback_on_new_best)
     children = callback.callbacks if isinstance(callback, CallbackList) else []
     for child in [*children, callback.callback] if isinstance(callback, EventCallback) else children:
         yield from eval_callbacks(child)

@@ -139,11 +139,7 @@ class OptionOffPolicyAlgorithm(OffPolicyAlgorithm):
         self._dt_was_given = dt is not None
         #: τ, in 1/s
         self.discount_rate = discount_rate_from_gamma(gamma, gamma_dt)
-        if updates_per_second is not None and gradient_steps != -1:
-            raise ValueError(
-                f"updates_per_second={updates_per_second} and gradient_steps={gradient_steps} both say how often "
-                "to update: pass one of them"
-            )
+        _refuse_both(updates_per_second, gradient_steps)
         self.updates_per_second = updates_per_second
         self.n_sub_options = n_sub_options
         #: Of the latest decisions since logs were written
@@ -287,7 +283,11 @@ class OptionOffPolicyAlgorithm(OffPolicyAlgorithm):
         expected = OptionSpace.make(**{**known, "d_min": known["d_min"] or known["dt"]})
         for one in settings:
             for name, (value, found) in expected.differences(one).items():
-                hint = f", or pass dt={found} to load, where options last as long at another rate" if name == "dt" else ""
+                hint = ""
+                if name == "dt" and "dt" in self._kept_when_loaded:
+                    hint = ". To evaluate at another rate, pass the environment as wrap_env(env) has it"
+                elif name == "dt":
+                    hint = f", or pass dt={found} to load, where options last as long at another rate"
                 raise ValueError(
                     f"the environment's options have {name}={found}, {type(self).__name__} has "
                     f"{name}={value}: give both the same (discount_rate is -ln(gamma)/gamma_dt){hint}"
@@ -351,6 +351,7 @@ class OptionOffPolicyAlgorithm(OffPolicyAlgorithm):
             _check_unit(given.get("reward_scale", "auto"), unit)
             kwargs["replay_buffer_kwargs"] = {**given, "reward_scale": unit}
         # Of two that say the same in different ways, the one that is given holds.
+        _refuse_both(kwargs.get("updates_per_second"), kwargs.get("gradient_steps", -1))
         if "gradient_steps" in kwargs:
             kwargs.setdefault("updates_per_second", None)
         elif kwargs.get("updates_per_second") is not None:
@@ -662,6 +663,14 @@ class OptionOffPolicyAlgorithm(OffPolicyAlgorithm):
         """
         options, state = super().predict(observation, state, episode_start, deterministic)
         return options.view(OptionArray), state
+
+
+def _refuse_both(updates_per_second: float | None, gradient_steps: int) -> None:
+    if updates_per_second is not None and gradient_steps != -1:
+        raise ValueError(
+            f"updates_per_second={updates_per_second} and gradient_steps={gradient_steps} both say how often to update: pass "
+            "one of them"
+        )
 
 
 def _check_unit(given: float | str, unit: float | str) -> None:

@@ -93,7 +93,7 @@ class SoftOptionActorCritic(OptionOffPolicyAlgorithm):
 
     def _setup_temperatures(self) -> None:
         """All temperatures and what belongs to them as vectors ``[n + 1]``: those of what to do, and the duration's."""
-        if isinstance(self.target_entropy, str):
+        if not callable(self.target_entropy):
             self.target_entropy = parse_target_entropy("target_entropy", self.target_entropy, self._auto_target_entropy())
         coef, learned = _parse_ent_coef("ent_coef", self.ent_coef)
         duration_coef, duration_learned = _parse_ent_coef("duration_ent_coef", self.duration_ent_coef)
@@ -272,14 +272,14 @@ class SoftOptionActorCritic(OptionOffPolicyAlgorithm):
         return state_dicts, ["log_ent_coefs"]
 
 
-def parse_target_entropy(name: str, value: str, auto: float) -> float:
-    """A target entropy that was given as a string.
+def parse_target_entropy(name: str, value: str | float, auto: float) -> float:
+    """A target entropy that is no function.
 
-    :raises ValueError: if it is neither "auto" nor a number
+    :raises ValueError: if it is neither "auto" nor a finite number
     """
     try:
-        target = auto if value == "auto" else float(value)
-    except ValueError:
+        target = auto if isinstance(value, str) and value == "auto" else float(value)
+    except (TypeError, ValueError):
         target = math.nan
     if not math.isfinite(target):
         raise ValueError(f"{name} must be a number, a function of the remaining progress or 'auto', not {value!r}")

@@ -31,7 +31,7 @@ def _parse_penalty(value: float | str | Schedule) -> tuple[float | Schedule, boo
     if not isinstance(value, str):
         if not callable(value) and not math.isfinite(value):
             raise ValueError(f"high_freq_penalty must be a finite number, not {value}")
-        return value, False
+        return value if callable(value) else float(value), False
     try:
         coefficient = float(value.removeprefix("relative_")) if value.startswith("relative_") else -1.0
     except ValueError:
@@ -292,7 +292,7 @@ class CTCO(SoftOptionActorCritic):
         self.fast_updates_refusal: str | None = None
         if self.target_decision_rate is not None:
             assert isinstance(coefficient, int | float)
-            self.log_high_freq_penalty = th.tensor(math.log(coefficient), requires_grad=True)
+            self.log_high_freq_penalty = th.tensor(math.log(coefficient), device=self.device, requires_grad=True)
             self.high_freq_penalty_optimizer = th.optim.Adam([self.log_high_freq_penalty], lr=self.lr_schedule(1))
             #: What the replay buffer had counted at the last training: decisions, and their time in s; a file's goes on.
             self._counted_decisions: tuple[int, float] = getattr(self, "_counted_decisions", (0, 0.0))
@@ -428,7 +428,13 @@ class CTCO(SoftOptionActorCritic):
         coefficient, relative = _parse_penalty(self.high_freq_penalty)
         if self.target_decision_rate is not None:
             coefficient = math.exp(self.log_high_freq_penalty.item())
-        return FloatSchedule(coefficient)(self._current_progress_remaining) * (self._penalty_unit if relative else 1.0)
+        penalty = FloatSchedule(coefficient)(self._current_progress_remaining)
+        if not math.isfinite(penalty):
+            raise ValueError(
+                f"high_freq_penalty returned {penalty} at a remaining progress of {self._current_progress_remaining:g}: it "
+                "must be finite"
+            )
+        return penalty * (self._penalty_unit if relative else 1.0)
 
     def _paid_in_the_shortest_option(self) -> float:
         """What a relative β_h is a multiple of: mean abs(R) a second, times ``d_min``, in the unit of the critics."""
@@ -451,7 +457,7 @@ class CTCO(SoftOptionActorCritic):
         update_learning_rate(self.high_freq_penalty_optimizer, self.lr_schedule(self._current_progress_remaining))
         # Bounded, so that rare long options do not make Adam's steps small for long.
         shortfall = max(-1.0, 1.0 - self.target_decision_rate * time_played / decisions)
-        self.log_high_freq_penalty.grad = th.tensor(-shortfall)
+        self.log_high_freq_penalty.grad = th.full_like(self.log_high_freq_penalty, -shortfall)
         self.high_freq_penalty_optimizer.step()
 
     def _excluded_save_params(self) -> list[str]:

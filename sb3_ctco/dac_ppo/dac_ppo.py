@@ -209,12 +209,13 @@ class DACPPO(OnPolicyAlgorithm):
         if self._dt_was_given:
             return
         found = find_dt_of_all(env)
+        check_seconds(dt=found)
         if self.dt is not None and found is not None and not np.isclose(found, self.dt, rtol=1e-6, atol=0.0):
             raise ValueError(
                 f"the environment has dt={found}, DACPPO has dt={self.dt}: a policy is for one dt, so make the environment "
                 "with the same"
             )
-        self.dt = found or self.dt
+        self.dt = self.dt if found is None else found
         if self.dt is None and (self.gamma_dt is not None or self.updates_per_second is not None):
             raise ValueError(
                 f"the environment {UNTOLD_DT}: pass dt, in seconds, to DACPPO, or gamma_dt=None for a gamma and a gae_lambda "

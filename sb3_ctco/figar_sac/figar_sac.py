@@ -82,7 +82,7 @@ class FiGARSAC(SoftOptionActorCritic):
     """
 
     _own_setting: ClassVar[str] = "n_repetitions"
-    _kept_when_loaded: ClassVar[tuple[str, ...]] = (*SoftOptionActorCritic._kept_when_loaded, "n_repetitions")
+    _kept_when_loaded: ClassVar[tuple[str, ...]] = (*SoftOptionActorCritic._kept_when_loaded, "n_repetitions", "dt")
 
     policy_aliases: ClassVar[dict[str, type[BasePolicy]]] = {
         "MlpPolicy": MlpPolicy,
@@ -238,7 +238,7 @@ class FiGARSAC(SoftOptionActorCritic):
         self.policy_kwargs = given
 
     def _setup_temperatures(self) -> None:
-        if isinstance(self.duration_target_entropy, str):
+        if not callable(self.duration_target_entropy):
             assert self.n_repetitions is not None
             self.duration_target_entropy = parse_target_entropy(
                 "duration_target_entropy", self.duration_target_entropy, 0.4 * math.log(self.n_repetitions)

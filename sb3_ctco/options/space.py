@@ -152,7 +152,7 @@ class OptionSpace:
         return {
             name: (here, there)
             for name, (here, there) in pairs.items()
-            if not (here == there or (isinstance(here, float) and math.isclose(here, there, rel_tol=1e-6)))
+            if not (here == there or (isinstance(here, int | float) and math.isclose(here, there, rel_tol=1e-6)))
         }
 
     def duration(self, option: FloatArray) -> float:
