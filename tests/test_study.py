@@ -181,14 +181,14 @@ def of_ctco(**changes):
         ({"tasks": {"cheetah": {"rate": 50}}}, r"task cheetah: \[\] missing, \['rate'\] unknown"),
         ({"tasks": {"cheetah": {"evaluations": 0}}}, "task cheetah: evaluations must be a whole number from 1, not 0"),
         ({"rates": [50.5]}, r"rates must be a list of whole numbers of Hz, each once, not \[50.5\]"),
-        ({"seeds": 0}, "seeds must be a whole number from 1, not 0"),
+        ({"seeds": 0}, "seeds must be a whole number from 1, how many there are, not 0"),
         ({"task_seconds": 50}, "task_seconds must be at least 100, so that an episode of 10 s ends in the last tenth"),
         ({"step": 1}, r"\[\] missing, \['step'\] unknown"),
         ({"algorithms": {"ppo": {"setting": "a", "arguments": {}}}}, "must be one of .* not 'ppo'"),
         ({"tasks": [{"cheetah": 1}]}, r"there is no task \{'cheetah': 1\}"),
         ({"tasks": {"cheetah": {"arguments": [1]}}}, r"task cheetah: arguments must be a mapping .* not \[1\]"),
-        ({"seeds": True}, "seeds must be a whole number from 1, not True"),
-        ({"seeds": 1.0}, "seeds must be a whole number from 1, not 1.0"),
+        ({"seeds": [11, 12]}, r"seeds must be a whole number .*, not \[11, 12\]: which ones, .* --seeds tells"),
+        ({"seeds": True}, "seeds must be a whole number from 1, .*, not True"),
         ({"eval_episodes": True}, "eval_episodes must be a whole number from 1, not True"),
         ({"task_seconds": math.inf}, "task_seconds must be at least 100, .* and finite, not inf"),
         ({"task_seconds": math.nan}, "task_seconds must be at least 100, .* and finite, not nan"),
@@ -741,7 +741,7 @@ def test_scores_by_hand(few_resamples):
     )
     _, low, high = better["sac", "a"][50]
     assert low <= 0.125 <= high
-    assert "| CTCO | a | 0.50 [" in tables.averaged_table(relative)
+    assert "| CTCO | a | 2 | 0.50 [" in tables.averaged_table(relative)
     # A rate that a line lacks leaves it out of the average over rates, and in at the others.
     without = scores.relative_scores([r for r in records if (r["algorithm"], r["dt"]) != ("sac", 0.02)], "discounted_return")
     assert list(scores.frequency_averaged(without)) == [("ctco", "a")]
@@ -767,7 +767,7 @@ def test_the_best_repeat_has_as_many_seeds_as_any():
 def test_the_same_seed_of_two_presets_is_no_second_seed(tmp_path):
     one = write_csv(tmp_path / "one.csv", synthetic())
     other = write_csv(tmp_path / "other.csv", [{**record, "preset": "native"} for record in synthetic()])
-    with pytest.raises(ValueError, match=r"of preset native, and preset quick has it, too: they are no two seeds"):
+    with pytest.raises(ValueError, match=r"presets quick and native both have seed 0 of .*: they are no two seeds"):
         plots.plot([one, other], tmp_path / "figures")
 
 
@@ -1079,7 +1079,7 @@ def test_a_run_in_two_sources_is_one_run(tmp_path):
 def test_curves_of_episodes_that_end_at_other_times_have_a_mean():
     """0 at 0 s and 10 at 10 s; 0 at 5 s and 20 at 15 s: at 5 s the mean of 5 and 0, at 10 s that of 10 and 10."""
     together = plots._together([[(0.0, 0.0), (10.0, 10.0)], [(5.0, 0.0), (15.0, 20.0)]])
-    assert together == {0.0: [0.0], 5.0: [5.0, 0.0], 10.0: [10.0, 10.0], 15.0: [20.0]}
+    assert together == {5.0: [5.0, 0.0], 10.0: [10.0, 10.0]}  # where there are both
 
 
 def test_a_legend_has_what_any_panel_has():
@@ -1165,3 +1165,72 @@ def test_a_subclass_has_its_bases_arguments_in_a_preset():
     assert row.arguments(given, 0.02, 10.0, "a preset") == given
     with pytest.raises(ValueError, match=r"a preset has no arguments \['beta'\]"):
         row.arguments({**given, "beta": 1}, 0.02, 10.0, "a preset")
+
+
+def test_seeds_of_other_settings_make_no_mean(tmp_path):
+    first = load_preset(tiny(tmp_path, seeds=1)).runs
+    runs.plan(first, tmp_path / "study")
+    other = load_preset(tiny(tmp_path, name="other", task_seconds=200)).select(seeds=[1])
+    with pytest.raises(ValueError, match=r"seed0/settings.json has other settings than preset tiny: task_seconds: 100"):
+        runs.plan(other, tmp_path / "study")
+    assert not (tmp_path / "study" / other[0].name).exists()
+    runs.plan(load_preset(tiny(tmp_path, name="same")).select(seeds=[1]), tmp_path / "study")
+
+
+def test_a_run_that_failed_is_planned_anew_with_other_settings(tmp_path):
+    (run,) = load_preset(tiny(tmp_path, seeds=1)).runs
+    runs.plan([run], tmp_path / "study")
+    runs.record_failure(run, tmp_path / "study", ValueError("a mistake in an argument"))
+    (corrected,) = load_preset(tiny(tmp_path, seeds=1, task_seconds=200)).runs
+    runs.plan([corrected], tmp_path / "study")
+    assert runs.read_json(tmp_path / "study" / run.name / "settings.json")["task_seconds"] == 200
+    (tmp_path / "study" / run.name / "record.json").write_text("{}")
+    with pytest.raises(ValueError, match="has other settings"):
+        runs.plan([run], tmp_path / "study")
+
+
+def test_a_record_that_is_damaged_is_named(tmp_path):
+    (run,) = load_preset(tiny(tmp_path, seeds=1)).runs
+    runs.plan([run], tmp_path)
+    (tmp_path / run.name / "record.json").write_text("")
+    for read in (read_records, status.read_status):
+        with pytest.raises(ValueError, match=r"record.json is damaged .*: delete .* to run it again"):
+            read(tmp_path)
+
+
+def test_none_that_fits_is_no_error(tmp_path, capsys):
+    assert main(["run", "--preset", tiny(tmp_path), "--folder", str(tmp_path / "study"), "--hours", "0.0000001"]) == 0
+    assert "0 of 2 runs fit into" in capsys.readouterr().out
+
+
+def test_a_name_that_is_there_twice(tmp_path):
+    file = Path(tiny(tmp_path))
+    file.write_text(file.read_text() + "\nseeds: 3\n")
+    with pytest.raises(ValueError, match="'seeds' is there twice"):
+        load_preset(str(file))
+
+
+def test_entries_without_runs_or_with_the_same_folder(tmp_path):
+    with pytest.raises(ValueError, match=r"ctco \(small\) has no run, since no task has one of its rates \[100\]"):
+        load_preset(tiny(tmp_path, algorithms={"ctco": {"setting": "small", "rates": [100], "arguments": {}}}))
+    same = {"sac": {"setting": "repeat_x", "arguments": {}}, "sac_repeat": {"setting": "x", "arguments": {}}}
+    with pytest.raises(ValueError, match=r"sac_repeat \(x\) and sac \(repeat_x\) would have the same folder"):
+        load_preset(tiny(tmp_path, algorithms=same))
+
+
+def test_versions_of_what_is_installed(monkeypatch):
+    monkeypatch.setattr(runs, "_PACKAGES", ("numpy", "not-installed-anywhere"))
+    assert list(runs.package_versions()) == ["python", "numpy"]
+
+
+def test_figures_of_one_rate_and_of_costs(tmp_path):
+    """Points and their intervals are side by side, and the worst seed is inside of the panel."""
+    records = [{**r, "discounted_return": -10.0 - r["seed"]} for r in synthetic() if r["dt"] == 0.02]
+    figure = plots.draw_metric(records, "discounted_return")
+    for ax in figure.axes:
+        low, high = ax.get_xlim()
+        assert low < 50 / 1.2
+        assert high > 50 * 1.2
+        assert ax.get_ylim()[0] < -11.0
+    pareto = plots.draw_pareto([{**r, "decision_rate_hz": 0.4} for r in records], "discounted_return")
+    assert all(ax.get_xlim()[0] < 0.4 for ax in pareto.axes)

@@ -191,7 +191,8 @@ class AsynchronousTrainer(Generic[AlgorithmType]):
         self._demonstration_folder = self.folder / "demonstrations"
         self._demonstrations: JournalWriter | None = None
         self._take_over: TakeOverWrapper | None = None
-        if not resume and (self._journal_folder.exists() or segments(self._demonstration_folder)):
+        made = self._journal_folder.exists() or (self.folder / "model.zip").exists()
+        if not resume and (made or segments(self._demonstration_folder)):
             raise FileExistsError(
                 f"{self.folder} holds the experience of an earlier run: pass resume=True to continue it, or another folder"
             )
@@ -425,7 +426,9 @@ class AsynchronousTrainer(Generic[AlgorithmType]):
         except LearnerError as error:
             if self.real_time is None or self.real_time.guard is None:
                 raise
-            self.real_time.alarm = str(error).splitlines()[0]
+            # The last line of a traceback says what went wrong.
+            lines = str(error).splitlines()
+            self.real_time.alarm = " ".join(dict.fromkeys([lines[0], lines[-1]]))
 
     def _make_safe(self) -> None:
         option_env = unwrap_wrapper(self.model.env.envs[0], RealTimeOptionWrapper)  # type: ignore[union-attr]

@@ -221,6 +221,8 @@ class _Progress:
             self._show()
 
     def _show(self) -> None:
+        if not self.names:  # none fits into --hours
+            return
         from sb3_ctco.study.status import read_status
 
         status = read_status(self.folder, self.names)

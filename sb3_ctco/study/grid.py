@@ -123,6 +123,18 @@ def preset_names() -> list[str]:
     return sorted(file.name.removesuffix(".yml") for file in files if file.name.endswith(".yml"))
 
 
+class _Loader(yaml.SafeLoader):
+    """YAML's, where of two entries of one name the second does not silently take the place of the first."""
+
+    def compose_mapping_node(self, anchor: Any) -> Any:
+        node = super().compose_mapping_node(anchor)
+        names = [key.value for key, _ in node.value]
+        for key, _ in node.value:
+            if names.count(key.value) > 1:
+                raise yaml.constructor.ConstructorError(None, None, f"{key.value!r} is there twice", key.start_mark)
+        return node
+
+
 def load_preset(name: str) -> Preset:
     """Read a preset.
 
@@ -136,7 +148,7 @@ def load_preset(name: str) -> Preset:
     else:
         raise ValueError(f"there is no preset {name!r}: name one of {preset_names()}, or a YAML file")
     try:
-        parsed = yaml.safe_load(content)
+        parsed = yaml.load(content, _Loader)
     except (yaml.YAMLError, ValueError) as error:  # a date that there is not is a ValueError
         raise ValueError(f"preset {name} is no YAML: {error}") from error
     return Preset(name, tuple(_grid(name, parsed)))
@@ -154,7 +166,11 @@ def _grid(preset: str, content: Any) -> list[Run]:
     if not (isinstance(tasks, dict) and tasks):
         raise ValueError(f"{where}: tasks must be a list of tasks, each once, or a mapping, not {content['tasks']!r}")
     entries = _entries(where, content["algorithms"])
-    _check_whole(where, "seeds", content["seeds"])
+    if not _is_whole(content["seeds"]):
+        raise ValueError(
+            f"{where}: seeds must be a whole number from 1, how many there are, not {content['seeds']!r}: which ones, from 0 "
+            "on if nothing else is said, is what --seeds tells"
+        )
     # What the preset says of every task, and a task for itself
     shared = {name: content[name] for name in ("rates", "task_seconds", "eval_episodes", "evaluations") if name in content}
     cells = []
@@ -171,7 +187,10 @@ def _grid(preset: str, content: Any) -> list[Run]:
             cells.append((rate, name, settings))
     # Sorting keeps the order of the tasks at a rate.
     cells.sort(key=lambda cell: -cell[0])
-    return [
+    for algorithm, setting, _, rates in entries:
+        if rates is not None and not any(rate in rates for rate, _, _ in cells):
+            raise ValueError(f"{where}: {algorithm} ({setting}) has no run, since no task has one of its rates {rates}")
+    runs = [
         Run(
             preset,
             name,
@@ -189,6 +208,14 @@ def _grid(preset: str, content: Any) -> list[Run]:
         for algorithm, setting, arguments, rates in entries
         if rates is None or rate in rates
     ]
+    of_names: dict[str, Run] = {}
+    for run in runs:
+        if (other := of_names.setdefault(run.name, run)) is not run:
+            raise ValueError(
+                f"{where}: {run.algorithm} ({run.setting}) and {other.algorithm} ({other.setting}) would have the same folder "
+                f"{run.name}: give one of them another setting"
+            )
+    return runs
 
 
 def _entries(where: str, algorithms: Any) -> list[tuple[str, str, dict[str, Any], list[int] | None]]:

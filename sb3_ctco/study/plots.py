@@ -1,8 +1,9 @@
 """Figures of a study's records."""
 
 import math
+import textwrap
 from collections import defaultdict
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -91,6 +92,7 @@ def plot(
         figures["improvement"] = draw_improvement(records, relative)
     # A run that is in several sources is one run.
     of_runs = {(*key(point), point["seconds"]): point for source in sources for point in read_curves(source)}
+    _refuse_two_presets(of_runs.values())
     if points := chosen(list(of_runs.values())):
         figures["learning_curves"] = draw_learning_curves(points)
     written = []
@@ -112,7 +114,6 @@ def _merged(sources: Sequence[Path]) -> list[Record]:
     """
     merged: dict[tuple[Any, ...], Record] = {}
     lengths: dict[tuple[Any, ...], Record] = {}
-    seeds: dict[tuple[Any, ...], Record] = {}
     for source in sources:
         for record in read_records(source):
             there = merged.setdefault(key(record), record)
@@ -123,14 +124,21 @@ def _merged(sources: Sequence[Path]) -> list[Record]:
                     f"{source} has runs of preset {record['preset']} with {record['task_seconds']:g} s of task time, and "
                     f"preset {of_mean['preset']} has {of_mean['task_seconds']:g} s: they make no mean, plot one of them"
                 )
-            task, line, seed = record["task"], line_of(record), record["seed"]
-            of_seed = seeds.setdefault((task, line, rate_of(record), seed), record)
-            if of_seed["preset"] != record["preset"]:
-                raise ValueError(
-                    f"{source} has seed {seed} of {line} on {task} of preset {record['preset']}, and preset "
-                    f"{of_seed['preset']} has it, too: they are no two seeds, plot one of them"
-                )
+    _refuse_two_presets(merged.values())
     return list(merged.values())
+
+
+def _refuse_two_presets(rows: Iterable[Record]) -> None:
+    """Of records, or of points of learning curves."""
+    presets: dict[tuple[Any, ...], str] = {}
+    for row in rows:
+        task, line, seed = row["task"], line_of(row), row["seed"]
+        preset = presets.setdefault((task, line, rate_of(row), seed), row["preset"])
+        if preset != row["preset"]:
+            raise ValueError(
+                f"presets {preset} and {row['preset']} both have seed {seed} of {line} on {task}: they are no two seeds, plot "
+                "one of them"
+            )
 
 
 def draw_metric(records: Sequence[Record], metric: str) -> "Figure":
@@ -231,14 +239,15 @@ def draw_learning_curves(points: Sequence[Record]) -> "Figure":
 
 
 def _together(curves: Sequence[Sequence[tuple[float, float]]]) -> dict[float, list[float]]:
-    """Runs' returns by task time: episodes that end early end at other times in each run, so that between points are lines."""
-    together: dict[float, list[float]] = {seconds: [] for seconds in sorted({at for curve in curves for at, _ in curve})}
-    for curve in curves:
-        seconds, returns = np.array(sorted(curve)).T
-        for at, values in together.items():
-            if seconds[0] <= at <= seconds[-1]:
-                values.append(float(np.interp(at, seconds, returns)))
-    return together
+    """Runs' returns by task time: episodes that end early end at other times in each run, so that between points are lines.
+
+    From where all of them have a point to where one of them ends, so that the mean is of the same runs everywhere.
+    """
+    sorted_curves = [np.array(sorted(curve)).T for curve in curves]
+    first = max(seconds[0] for seconds, _ in sorted_curves)
+    last = min(seconds[-1] for seconds, _ in sorted_curves)
+    times = sorted({float(at) for seconds, _ in sorted_curves for at in seconds if first <= at <= last})
+    return {at: [float(np.interp(at, *curve)) for curve in sorted_curves] for at in times}
 
 
 def draw_pareto(records: Sequence[Record], metric: str) -> "Figure":
@@ -263,7 +272,10 @@ def draw_pareto(records: Sequence[Record], metric: str) -> "Figure":
             ax.set_xscale("log")
             ax.set_xticks(_DECISION_RATES, [str(tick) for tick in _DECISION_RATES])
             ax.minorticks_off()
-            ax.set_xlim(0.8, 700.0)
+            ax.set_xlim(
+                min(0.8, *(0.8 * rate for rate in decisions.values())),
+                max(700.0, *(1.3 * rate for rate in decisions.values())),
+            )
             ax.set_visible(bool(returns))  # A task that has a rate of its own has nothing at others'.
             means = [0.0, *(value for value, _ in returns.values())]
             ax.set_ylim(min(means) - 0.04 * max(*means, 0.1), 1.15 * max(*means, 0.1))
@@ -369,8 +381,9 @@ def _apart(rates: Sequence[int], line: Line, lines: Sequence[Line]) -> np.ndarra
 
 
 def _return_axis(ax: "Axes", shown: Sequence[float]) -> None:
-    """From zero to a little above what is shown; wide intervals of few seeds run off the panel."""
-    ax.set_ylim(min(0.0, *shown), 1.08 * max(*shown, 0.1))
+    """From zero, or a little below what is shown, to a little above it; wide intervals of few seeds run off the panel."""
+    low, high = min(0.0, *shown), max(*shown, 0.1)
+    ax.set_ylim(low - 0.08 * (high - low) if low < 0.0 else 0.0, high + 0.08 * (high - low))
 
 
 def _rate_axis(ax: "Axes", records: Sequence[Record]) -> None:
@@ -378,6 +391,8 @@ def _rate_axis(ax: "Axes", records: Sequence[Record]) -> None:
     ax.set_xscale("log")
     ax.set_xticks(rates, [str(rate) for rate in rates])
     ax.minorticks_off()
+    if len(rates) == 1:  # of which an axis has no length
+        ax.set_xlim(rates[0] / 1.3, rates[0] * 1.3)
     ax.set_xlabel("interaction frequency [Hz]")
 
 
@@ -385,5 +400,11 @@ def _legend(figure: "Figure", title: str) -> None:
     """Each label once, whichever panels it is in."""
     shown = [zip(*ax.get_legend_handles_labels(), strict=True) for ax in figure.axes if ax.get_visible()]
     entries = {label: handle for of_panel in shown for handle, label in of_panel}
-    place: dict[str, Any] = {"loc": "outside lower center", "ncols": 4, "fontsize": "small", "title_fontsize": "small"}
+    place: dict[str, Any] = {
+        "loc": "outside lower center",
+        "ncols": min(4, len(figure.axes) + 1),
+        "fontsize": "small",
+        "title_fontsize": "small",
+    }
+    title = textwrap.fill(title, round(15 * figure.get_figwidth()))
     figure.legend(list(entries.values()), list(entries), title=title, **place)

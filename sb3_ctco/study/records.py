@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from sb3_ctco.study.grid import Run
-from sb3_ctco.study.runs import MONITOR, RECORD, SETTINGS, write_whole
+from sb3_ctco.study.runs import MONITOR, RECORD, SETTINGS, read_json, write_whole
 
 Record = dict[str, Any]
 
@@ -65,7 +65,7 @@ def read_records(source: Path) -> list[Record]:
     if source.is_dir():
         # Runs of before had no sums of rewards.
         none = {"episode_return": math.nan, "greedy_episode_return": math.nan}
-        records = [{**none, **json.loads(file.read_text(encoding="utf-8"))} for file in sorted(source.glob(f"*/{RECORD}"))]
+        records = [{**none, **read_json(file)} for file in sorted(source.glob(f"*/{RECORD}"))]
     elif source.is_file():
         records = _read_csv(source, COLUMNS)
     else:

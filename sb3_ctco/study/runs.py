@@ -2,6 +2,7 @@
 
 import contextlib
 import csv
+import dataclasses
 import json
 import os
 import platform
@@ -25,6 +26,8 @@ from sb3_ctco.study.agents import discount_rate, make_eval_env, make_model
 from sb3_ctco.study.grid import Run
 
 SETTINGS, VERSIONS, RECORD, ERROR = "settings.json", "versions.json", "record.json", "error.txt"
+#: Runs that make one mean, over seeds
+_CELL = ("task", "algorithm", "setting", "rate")
 MONITOR, EVALUATION = "monitor.csv", "evaluation.csv"
 MONITOR_COLUMNS = ("task_seconds", "discounted_return", "decision_rate_hz", "wall_seconds")
 EVALUATION_COLUMNS = ("task_seconds", "discounted_return", "decision_rate_hz", "episode_return")
@@ -46,30 +49,44 @@ class Outcome:
 
 
 def plan(runs: Sequence[Run], folder: Path) -> None:
-    """Make the runs' folders, each with its settings.
+    """Make the runs' folders, each with its settings; those of a run that failed are written anew.
 
-    :raises ValueError: if a folder has other settings, or cannot be made
+    :raises ValueError: if a folder has other settings, also of another seed, since seeds make one mean, or cannot be made
     """
-    for run in runs:
-        file = folder / run.name / SETTINGS
-        try:
-            if file.exists():
-                _refuse_other_settings(run, _read_settings(file), file)
+    try:
+        # One seed of each cell will do, since the others were compared with it when they were planned.
+        there = {}
+        for file in sorted(folder.glob(f"*/{SETTINGS}")):
+            if (file.parent / RECORD).exists() or not (file.parent / ERROR).exists():
+                found = read_json(file)
+                there[tuple(found.get(name) for name in _CELL)] = found, file
+        for run in runs:
+            file = folder / run.name / SETTINGS
+            found, file_of_cell = there.get(tuple(getattr(run, name) for name in _CELL), (None, file))
+            if found is not None:
+                same_seed = dataclasses.replace(run, preset=found.get("preset"), seed=found.get("seed"))
+                _refuse_other_settings(same_seed, found, file_of_cell)
+            if file.exists() and ((file.parent / RECORD).exists() or not (file.parent / ERROR).exists()):
+                _refuse_other_settings(run, read_json(file), file)
             else:
                 file.parent.mkdir(parents=True, exist_ok=True)
                 write_whole(file, json.dumps(run.as_dict(), indent=1) + "\n")
-        except OSError as error:
-            raise ValueError(
-                f"{folder} cannot be the study's folder: {error}. Name another --folder, one that can be written to"
-            ) from error
+    except OSError as error:
+        raise ValueError(
+            f"{folder} cannot be the study's folder: {error}. Name another --folder, one that can be written to"
+        ) from error
 
 
-def _read_settings(file: Path) -> dict[str, Any]:
+def read_json(file: Path) -> dict[str, Any]:
+    """What a file of a run's folder holds.
+
+    :raises ValueError: if it is damaged, as a power cut may leave it
+    """
     try:
-        settings: dict[str, Any] = json.loads(file.read_text())
+        content: dict[str, Any] = json.loads(file.read_text(encoding="utf-8"))
     except ValueError as error:
         raise ValueError(f"{file} is damaged ({error}): delete {file.parent} to run it again") from error
-    return settings
+    return content
 
 
 def _refuse_other_settings(run: Run, found: dict[str, Any], file: Path) -> None:
@@ -216,7 +233,11 @@ def _train(run: Run, path: Path) -> None:
 
 def package_versions() -> dict[str, str]:
     """Versions of Python and of what computes the results."""
-    return {"python": platform.python_version(), **{name: metadata.version(name) for name in _PACKAGES}}
+    versions = {"python": platform.python_version()}
+    for name in _PACKAGES:
+        with contextlib.suppress(metadata.PackageNotFoundError):
+            versions[name] = metadata.version(name)
+    return versions
 
 
 def git_commit() -> str:
@@ -237,7 +258,10 @@ def write_whole(file: Path, text: str) -> None:
     """Write a file such that whoever reads it sees all of it, or what was there before."""
     part = file.with_name(f"{file.name}.{os.getpid()}")
     try:
-        part.write_text(text, encoding="utf-8")
+        with part.open("w", encoding="utf-8") as stream:
+            stream.write(text)
+            stream.flush()
+            os.fsync(stream.fileno())  # or a power cut may leave an empty file of that name
         os.replace(part, file)
     finally:
         part.unlink(missing_ok=True)

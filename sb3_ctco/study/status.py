@@ -1,7 +1,6 @@
 """How far a study is, read from its folder."""
 
 import csv
-import json
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -10,7 +9,7 @@ from typing import Any, Literal
 
 import numpy as np
 
-from sb3_ctco.study.runs import ERROR, MONITOR, RECORD, SETTINGS, is_running
+from sb3_ctco.study.runs import ERROR, MONITOR, RECORD, SETTINGS, is_running, read_json
 
 State = Literal["waiting", "running", "failed", "done"]
 #: Number of episodes that a current return is the mean of
@@ -104,10 +103,10 @@ def read_status(folder: Path, names: Sequence[str] | None = None) -> Status:
 
 
 def _read_run(path: Path) -> RunStatus:
-    settings = json.loads((path / SETTINGS).read_text(encoding="utf-8"))
+    settings = read_json(path / SETTINGS)
     cell = (settings["algorithm"], settings["setting"], settings["rate"])
     if (path / RECORD).exists():
-        record = json.loads((path / RECORD).read_text(encoding="utf-8"))
+        record = read_json(path / RECORD)
         return RunStatus(path.name, cell, "done", 1.0, record["wall_seconds"], record["discounted_return"])
     if is_running(path):
         return RunStatus(path.name, cell, "running", *_progress(path, settings))

@@ -83,10 +83,14 @@ def table(records: Sequence[Record], estimates: dict[str, Estimates]) -> str:
 
 def averaged_table(scores: dict[Line, dict[int, np.ndarray]]) -> str:
     """Markdown: scores averaged over rates."""
-    rows = [_row("algorithm", "setting", "score"), _row("---", "---", "---")]
+    rows = [_row("algorithm", "setting", "seeds", "score"), _row(*["---"] * 4)]
     for (algorithm, setting), estimate in frequency_averaged(scores).items():
-        rows.append(_row(ALGORITHMS[algorithm].label, setting, _interval_cell(estimate)))
-    caption = "Interquartile mean, over tasks and seeds, of the mean over rates of return by the best mean return at any rate."
+        n_seeds = min(len(matrix) for matrix in scores[algorithm, setting].values())
+        rows.append(_row(ALGORITHMS[algorithm].label, setting, str(n_seeds), _interval_cell(estimate)))
+    caption = (
+        "Interquartile mean, over tasks and seeds, of the mean over rates of return by the best mean return at any rate. Of "
+        "as many seeds, the first ones, as there are at each rate; who lacks a rate is left out."
+    )
     return "\n".join(["\n## Averaged over rates\n", caption, "", *rows, ""])
 
 
