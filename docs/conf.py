@@ -1,4 +1,4 @@
-"""Sphinx configuration: sphinx-build -W --keep-going -b html docs docs/_build/html."""
+"""Sphinx configuration; ``make docs`` makes the pages."""
 
 from sb3_ctco import __version__
 

@@ -77,7 +77,7 @@ def test_the_study_page_has_every_preset_and_its_own_one_loads(tmp_path):
     (tmp_path / "mine.yml").write_text(block)
     runs = load_preset(str(tmp_path / "mine.yml")).runs
     # Five seeds of two settings, on two tasks at two rates and on one at its own
-    assert len(runs) == 5 * 2 * (2 + 2 + 1)
+    assert len(runs) == 5 * 4 * (2 + 2 + 1)
     for run in runs:
         constructor_arguments(run)
 

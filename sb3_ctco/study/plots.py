@@ -364,9 +364,11 @@ def _line_with_intervals(
 ) -> None:
     """Draw a line over the rates with its intervals as bars, set a little apart from those of other lines."""
     style, label = _style(line, lines)
-    ax.plot(rates, means, marker="o", markersize=4, label=label, **style)
+    apart = _apart(rates, line, lines)
+    # A point that no line leads to stands with its interval.
+    ax.plot(apart if len(rates) == 1 else rates, means, marker="o", markersize=4, label=label, **style)
     ax.errorbar(
-        _apart(rates, line, lines),
+        apart,
         means,
         (means - low, high - means),
         fmt="none",
