@@ -45,7 +45,7 @@ def test_the_page_runs_against_a_robot_of_its_own_time(tmp_path):
     assert "AddedTrajectory" not in again.stdout
     # The robot was silent for 0.6 s in 4: less than 0.3 s is borne, and then joints are held, in learning and in playing.
     assert int(re.search(r"safe_ticks=(\d+)", result.stdout).group(1)) > 0
-    assert re.search(r"replaced by the safe action: {'no fresh observation': \d+}", result.stdout)
+    assert re.search(r"replaced by the safe action: {'no fresh observation': \d+, 'stopped': 1}", result.stdout)
     assert "the safe action is sent (no fresh observation)" in result.stderr
     # Somebody took over, and that was kept with the demonstrations.
     assert len(JournalReader(tmp_path / "runs" / "reach" / "demonstrations").read(100)) >= 3
