@@ -1080,6 +1080,7 @@ def test_curves_of_episodes_that_end_at_other_times_have_a_mean():
     """0 at 0 s and 10 at 10 s; 0 at 5 s and 20 at 15 s: at 5 s the mean of 5 and 0, at 10 s that of 10 and 10."""
     together = plots._together([[(0.0, 0.0), (10.0, 10.0)], [(5.0, 0.0), (15.0, 20.0)]])
     assert together == {5.0: [5.0, 0.0], 10.0: [10.0, 10.0]}  # where there are both
+    assert plots._together([]) == {}
 
 
 def test_a_legend_has_what_any_panel_has():

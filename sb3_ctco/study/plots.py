@@ -244,8 +244,8 @@ def _together(curves: Sequence[Sequence[tuple[float, float]]]) -> dict[float, li
     From where all of them have a point to where one of them ends, so that the mean is of the same runs everywhere.
     """
     sorted_curves = [np.array(sorted(curve)).T for curve in curves]
-    first = max(seconds[0] for seconds, _ in sorted_curves)
-    last = min(seconds[-1] for seconds, _ in sorted_curves)
+    first = max((seconds[0] for seconds, _ in sorted_curves), default=0.0)
+    last = min((seconds[-1] for seconds, _ in sorted_curves), default=0.0)
     times = sorted({float(at) for seconds, _ in sorted_curves for at in seconds if first <= at <= last})
     return {at: [float(np.interp(at, *curve)) for curve in sorted_curves] for at in times}
 
@@ -273,8 +273,7 @@ def draw_pareto(records: Sequence[Record], metric: str) -> "Figure":
             ax.set_xticks(_DECISION_RATES, [str(tick) for tick in _DECISION_RATES])
             ax.minorticks_off()
             ax.set_xlim(
-                min(0.8, *(0.8 * rate for rate in decisions.values())),
-                max(700.0, *(1.3 * rate for rate in decisions.values())),
+                min([0.8, *(0.8 * at for at in decisions.values())]), max([700.0, *(1.3 * at for at in decisions.values())])
             )
             ax.set_visible(bool(returns))  # A task that has a rate of its own has nothing at others'.
             means = [0.0, *(value for value, _ in returns.values())]
