@@ -50,6 +50,8 @@ def main() -> None:
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--output", type=Path, default=Path("runs/quickstart"), help="folder (default: %(default)s)")
     args = parser.parse_args()
+    if args.seconds < EPISODE_SECONDS:
+        parser.error(f"--seconds must be at least those of an episode, {EPISODE_SECONDS:g}, not {args.seconds:g}")
     args.output.mkdir(parents=True, exist_ok=True)
     # The networks are small: a second thread would cost more than it brings.
     th.set_num_threads(1)

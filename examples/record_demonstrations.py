@@ -35,6 +35,8 @@ def main() -> None:
     parser.add_argument("--episodes", type=int, default=10)
     parser.add_argument("--dataset", default="pendulum/sac-v0", help="its name; it goes to ~/.minari/datasets")
     args = parser.parse_args()
+    if args.dataset in minari.list_local_datasets():
+        raise SystemExit(f"there is a dataset {args.dataset} already: name another --dataset, or delete it with minari delete")
     env = gym.make(args.env)
     model = SAC.load(args.model) if args.model else SAC("MlpPolicy", env, seed=0).learn(args.steps, progress_bar=False)
     episodes = [record(model, env, seed) for seed in range(args.episodes)]

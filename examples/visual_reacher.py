@@ -81,7 +81,8 @@ def main() -> None:
         model.learn(n_steps, training, progress_bar=True)
         args.folder.mkdir(parents=True, exist_ok=True)
         model.save(args.folder / "model")
-    print("training:", describe(training.episodes[-len(training.episodes) // 10 :]))
+    if training.episodes:  # none if everything had been learned before
+        print("training:", describe(training.episodes[-max(1, len(training.episodes) // 10) :]))
     print("greedy:", describe(evaluate_discounted_return(model, model.wrap_env(gym.make(**task)))))
 
 

@@ -5,7 +5,6 @@ import math
 from collections import Counter
 from collections.abc import Callable
 from dataclasses import dataclass
-from numbers import Real
 from typing import Any, Literal
 
 import numpy as np
@@ -42,7 +41,9 @@ class Safety:
     def __post_init__(self) -> None:
         for name in ("stale_after", "max_rate", "max_slew"):
             value = getattr(self, name)
-            if not (value is None and name != "stale_after") and not (isinstance(value, Real) and value > 0):
+            if not (value is None and name != "stale_after") and not (
+                isinstance(value, int | float | np.number) and value > 0
+            ):
                 raise ValueError(f"{name} must be a positive number, not {value!r}")
         named = isinstance(self.safe_action, str) and self.safe_action in ("hold", "zero")
         if not (named or callable(self.safe_action)):

@@ -413,3 +413,10 @@ def test_stretches_leave_from_the_action_before_them(kind, join):
     with pytest.raises(ValueError, match="n actions, n rewards and n \\+ 1 observations"):
         wrong = observations[:-1] if kind == "vector" else {"q": observations[:-1]}
         buffer.add_trajectory(wrong, actions, rewards, False, True, 0.1)
+
+
+def test_a_loaded_buffer_has_the_share_that_the_model_was_given(tmp_path, random_walk_env):
+    CTCO("MlpPolicy", random_walk_env(), buffer_size=50).save_replay_buffer(tmp_path / "buffer")
+    model = CTCO("MlpPolicy", random_walk_env(), replay_buffer_kwargs={"demonstration_fraction": 0.75})
+    model.load_replay_buffer(tmp_path / "buffer")
+    assert model.replay_buffer.demonstration_fraction == 0.75

@@ -194,3 +194,11 @@ def test_a_monitor_inside_is_not(random_walk_env):
     CTCO("MlpPolicy", Monitor(random_walk_env()), **SMALL)
     CTCO("MlpPolicy", OptionExecutionWrapper(Monitor(random_walk_env())), **SMALL)
     CTCO("MlpPolicy", make_vec_env(random_walk_env, 2, wrapper_class=OptionExecutionWrapper), **SMALL)
+
+
+def test_what_predict_returned_can_be_planned(random_walk_env):
+    model = CTCO("MlpPolicy", random_walk_env())
+    option, _ = model.predict(random_walk_env().reset(seed=0)[0])
+    space = model.option_space
+    assert space.duration(option) == space.duration(option.vector)
+    np.testing.assert_array_equal(space.plan(option), space.plan(option.vector))

@@ -91,8 +91,11 @@ def test_a_file_is_loaded_with_what_it_was_made_with(tmp_path):
     given = {"d_min": 0, "trajectory": "rbf", "policy_kwargs": {"net_arch": [8]}}
     CTCO("MlpPolicy", "Pendulum-v1", buffer_size=10, **given).save(tmp_path / "ctco")
     assert CTCO.load(tmp_path / "ctco", env=gym.make("Pendulum-v1"), **given).d_min == 0.05
+    # The constructor's defaults, which it finds values for, and a trajectory by its class
+    found = {"dt": None, "d_max": None, "d_min": None, "trajectory": RadialBasis}
+    assert CTCO.load(tmp_path / "ctco", env=gym.make("Pendulum-v1"), **found).option_space.arguments["trajectory"] == "rbf"
     FiGARSAC("MlpPolicy", "Pendulum-v1", buffer_size=10, policy_kwargs={"net_arch": [8]}).save(tmp_path / "figar_sac")
-    assert FiGARSAC.load(tmp_path / "figar_sac", policy_kwargs={"net_arch": [8]}).n_repetitions == 20
+    assert FiGARSAC.load(tmp_path / "figar_sac", policy_kwargs={"net_arch": [8]}, n_repetitions=None).n_repetitions == 20
     with pytest.raises(ValueError, match=r"'d_min': 0.05.*cannot be changed while loading"):
         CTCO("MlpPolicy", "Pendulum-v1", buffer_size=10, d_min=0.1).save(tmp_path / "longer")
         CTCO.load(tmp_path / "longer", d_min=0)

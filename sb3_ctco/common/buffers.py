@@ -2,7 +2,6 @@
 
 import dataclasses
 import math
-from numbers import Real
 from typing import Any, Literal, NamedTuple
 
 import numpy as np
@@ -73,7 +72,7 @@ class _OptionStorage(ReplayBuffer):
     ):
         if not 0.0 <= demonstration_fraction <= 1.0:
             raise ValueError(f"demonstration_fraction must be a part of each batch, in [0, 1], not {demonstration_fraction}")
-        if reward_scale != "auto" and not (isinstance(reward_scale, Real) and 0 < reward_scale < math.inf):
+        if reward_scale != "auto" and not (isinstance(reward_scale, int | float | np.number) and 0 < reward_scale < math.inf):
             raise ValueError(f"reward_scale must be a positive number or 'auto', not {reward_scale!r}")
         if optimize_memory_usage:
             raise ValueError(

@@ -10,6 +10,8 @@ from typing import Any
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.save_util import load_from_zip_file
 
+from sb3_ctco.options import TRAJECTORIES
+
 
 def check_load_arguments(
     algorithm: type[BaseAlgorithm],
@@ -38,13 +40,16 @@ def check_load_arguments(
         data, _, _ = load_from_zip_file(path, device="cpu")
         assert data is not None
         data = {**(older or {}), **data}
-        differing = {name: arguments[name] for name in fixed if not _equal(arguments[name], data.get(name))}
+        # Of what the constructor finds by itself, None stands for what it found.
+        given = [name for name in fixed if arguments[name] is not None]
+        differing = {name: arguments[name] for name in given if not _equal(arguments[name], data.get(name))}
         if differing:
             of_file = {name: data.get(name) for name in differing}
             raise ValueError(
                 f"{differing} cannot be changed while loading: the file's networks were trained with {of_file}. Leave them "
                 f"out, or make a new model; these can be changed: {sorted(known - set(kept))}"
             )
+    arguments = {name: value for name, value in arguments.items() if name not in fixed}  # as the file says
     return {"_stats_window_size" if name == "stats_window_size" else name: value for name, value in arguments.items()}
 
 
@@ -66,6 +71,8 @@ def constructor_parameters(algorithm: Callable[..., BaseAlgorithm]) -> dict[str,
 
 
 def _equal(one: Any, other: Any) -> bool:
+    if isinstance(one, type) and isinstance(other, str):  # a trajectory by its class
+        return TRAJECTORIES.get(other) is one
     # FiGAR-SAC's d_max is a number of steps times dt by the time it is saved.
     if isinstance(one, int | float) and isinstance(other, int | float):
         return math.isclose(one, other, rel_tol=1e-9)

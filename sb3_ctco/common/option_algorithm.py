@@ -340,6 +340,8 @@ class OptionOffPolicyAlgorithm(OffPolicyAlgorithm):
         """
         saved = cls._saved_attributes(path)
         older = cls._arguments_of_older_files(saved) if saved else {}
+        if kwargs.get("dt", 0.0) is None:
+            del kwargs["dt"]  # to be found, as without it
         if kwargs.get("d_min") == 0.0:
             kwargs["d_min"] = saved.get("dt")  # as which it was saved
         # With a target rate β_h is learned, and the file has it.
@@ -357,7 +359,7 @@ class OptionOffPolicyAlgorithm(OffPolicyAlgorithm):
         elif kwargs.get("updates_per_second") is not None:
             kwargs["gradient_steps"] = -1
         if "dt" in kwargs:
-            kwargs["_dt_was_given"] = kwargs["dt"] is not None
+            kwargs["_dt_was_given"] = True
         if env is not None:
             kwargs["n_envs"] = env.num_envs if isinstance(env, VecEnv) else 1
         model = super().load(path, None, device, custom_objects, print_system_info, force_reset, **kwargs)
@@ -465,7 +467,8 @@ class OptionOffPolicyAlgorithm(OffPolicyAlgorithm):
         except BaseException:
             self.replay_buffer = own
             raise
-        self.replay_buffer.reward_scale = self.replay_buffer_kwargs["reward_scale"]  # type: ignore[union-attr]
+        for name in {"reward_scale", "demonstration_fraction"} & self.replay_buffer_kwargs.keys():
+            setattr(self.replay_buffer, name, self.replay_buffer_kwargs[name])
         self._tell_buffer()
 
     def _check_loaded_buffer(self, path: Any) -> None:

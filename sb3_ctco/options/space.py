@@ -7,6 +7,7 @@ from typing import Any, Literal
 import numpy as np
 import numpy.typing as npt
 
+from sb3_ctco.option_array import plain
 from sb3_ctco.options.semi_mdp import DEFAULT_DISCOUNT_RATE, FloatArray, check_seconds, steps_in
 from sb3_ctco.options.trajectory import TRAJECTORIES, Trajectory
 
@@ -157,7 +158,7 @@ class OptionSpace:
 
     def duration(self, option: FloatArray) -> float:
         """The duration d that an option vector asks for, in s: its last entry, mapped from [−1, 1] to [d_min, d_max]."""
-        return self.seconds(float(option[-1]))
+        return self.seconds(float(plain(option)[-1]))
 
     def seconds(self, normalised: Any) -> Any:
         """The duration in s that a number in [−1, 1] stands for, or an array or tensor of such."""
@@ -197,6 +198,7 @@ class OptionSpace:
         :param option: shape ``[action_dim · n_weights + 1]``, entries in [−1, 1]
         :return: ω, shape ``[action_dim, n_weights]``, and the number of primitive steps
         """
+        option = plain(option)
         return option[:-1].reshape(-1, self.trajectory.n_weights), steps_in(self.duration(option), self.dt)
 
     def closest(self, plan: FloatArray, before: FloatArray | None = None) -> tuple[FloatArray, float]:

@@ -55,17 +55,18 @@ def plan(runs: Sequence[Run], folder: Path) -> None:
     """
     try:
         # One seed of each cell will do, since the others were compared with it when they were planned.
-        there = {}
+        there: dict[tuple[Any, ...], tuple[dict[str, Any], Path]] = {}
         for file in sorted(folder.glob(f"*/{SETTINGS}")):
             if (file.parent / RECORD).exists() or not (file.parent / ERROR).exists():
                 found = read_json(file)
                 there[tuple(found.get(name) for name in _CELL)] = found, file
         for run in runs:
             file = folder / run.name / SETTINGS
-            found, file_of_cell = there.get(tuple(getattr(run, name) for name in _CELL), (None, file))
-            if found is not None:
-                same_seed = dataclasses.replace(run, preset=found.get("preset"), seed=found.get("seed"))
-                _refuse_other_settings(same_seed, found, file_of_cell)
+            cell = tuple(getattr(run, name) for name in _CELL)
+            if cell in there:
+                found, of_cell = there[cell]
+                of_the_same_seed = dataclasses.replace(run, preset=found["preset"], seed=found["seed"])
+                _refuse_other_settings(of_the_same_seed, found, of_cell)
             if file.exists() and ((file.parent / RECORD).exists() or not (file.parent / ERROR).exists()):
                 _refuse_other_settings(run, read_json(file), file)
             else:
