@@ -614,11 +614,9 @@ class Unsaveable(SAC):
 
 def test_a_learner_without_room_for_its_checkpoint_is_reported(tmp_path):
     env = Point()
+    trainer = AsynchronousTrainer(make_model(Unsaveable, env), env, tmp_path, checkpoint_seconds=0.2)
     (tmp_path / "model.zip").write_bytes(b"the one before")
-    with (
-        AsynchronousTrainer(make_model(Unsaveable, env), env, tmp_path, checkpoint_seconds=0.2) as trainer,
-        pytest.raises(LearnerError, match="No space left on device"),
-    ):
+    with trainer, pytest.raises(LearnerError, match="No space left on device"):
         trainer.learn(1000)
     assert env.commands[-1] == 0.0
     assert (tmp_path / "model.zip").read_bytes() == b"the one before"
@@ -1251,6 +1249,13 @@ def test_what_is_not_finite_is_not_learned_from(tmp_path, algorithm, fault):
     for transition in records_of(tmp_path):
         assert np.isfinite(transition.next_obs).all()
         assert np.isfinite(transition.reward).all()
+
+
+def test_a_folder_with_the_model_of_an_earlier_run_is_refused(tmp_path):
+    env = Point()
+    (tmp_path / "model.zip").write_bytes(b"the one before")
+    with pytest.raises(FileExistsError, match="holds the experience of an earlier run: pass resume=True"):
+        AsynchronousTrainer(make_model(SAC, env), env, tmp_path)
 
 
 def test_learning_that_diverges_leaves_the_checkpoint_as_it_was(tmp_path):

@@ -426,9 +426,9 @@ class AsynchronousTrainer(Generic[AlgorithmType]):
         except LearnerError as error:
             if self.real_time is None or self.real_time.guard is None:
                 raise
+            first, *further = str(error).splitlines()
             # The last line of a traceback says what went wrong.
-            lines = str(error).splitlines()
-            self.real_time.alarm = " ".join(dict.fromkeys([lines[0], lines[-1]]))
+            self.real_time.alarm = f"{first} {further[-1]}" if first.endswith(":") else first
 
     def _make_safe(self) -> None:
         option_env = unwrap_wrapper(self.model.env.envs[0], RealTimeOptionWrapper)  # type: ignore[union-attr]
