@@ -251,9 +251,15 @@ def _together(curves: Sequence[Sequence[tuple[float, float]]]) -> dict[float, li
 
 
 def draw_pareto(records: Sequence[Record], metric: str) -> "Figure":
-    """Return over decisions a second: a row a rate, a column a task, a point a setting, by its name."""
+    """Return over decisions a second: a row a rate, a column a task, a point a setting, by its name.
+
+    Of the rates at which there is something to compare, if there are any.
+    """
     tasks, lines = tasks_of(records), lines_of(records)
-    rates = sorted({rate_of(record) for record in records})
+    at_rates: dict[int, set[Line]] = defaultdict(set)
+    for record in records:
+        at_rates[rate_of(record)].add(line_of(record))
+    rates = sorted(rate for rate, there in at_rates.items() if len(there) > 1) or sorted(at_rates)
     figure, axes = _panels(len(rates), len(tasks))
     for row, rate in zip(axes, rates, strict=True):
         for ax, task in zip(row, tasks, strict=True):
