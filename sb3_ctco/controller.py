@@ -23,6 +23,7 @@ from sb3_ctco.options import (
     OptionSpace,
     ValueInterrupt,
     check_seconds,
+    is_finite,
     shortest_steps,
     stack,
     steps_in,
@@ -36,6 +37,8 @@ if TYPE_CHECKING:
     from sb3_ctco.common.option_algorithm import OptionOffPolicyAlgorithm
 
 logger = logging.getLogger(__name__)
+
+_NOW_OR_NEVER = "give now at each tick or at none; to change, call reset() in between"
 
 
 class OptionPolicy(Protocol):
@@ -299,7 +302,7 @@ class OptionController:
         executions = self._executions
         if executions:
             if (now is None) != (self._now is None):
-                raise ValueError("give now at each tick or at none; to change, call reset() in between")
+                raise ValueError(_NOW_OR_NEVER)
             if self._several and observation is not None and len(_first_leaf(observation)) != len(executions):
                 raise ValueError(
                     f"there are {len(_first_leaf(observation))} observations, and there were {len(executions)}: "
@@ -338,7 +341,7 @@ class OptionController:
         if self.safety is None:
             raise ValueError("safety=None has no safe action: pass OptionController(policy, safety=Safety(...))")
         if self._executions and self._now is None:
-            raise ValueError("give now at each tick or at none; to change, call reset() in between")
+            raise ValueError(_NOW_OR_NEVER)
         return self._guarded(None, self._checked(now), None, "stopped")
 
     def _checked(self, now: float) -> float:
@@ -465,10 +468,8 @@ class OptionController:
 
     def _ask(self, observation: Observation, sent: list[np.ndarray], several: bool) -> np.ndarray:
         """Options for one or several observations, and the last two actions before each."""
-        for leaf in observation.values() if isinstance(observation, dict) else [observation]:
-            numbers = np.asarray(leaf)
-            if numbers.dtype.kind == "f" and not np.isfinite(numbers).all():  # which normalisation would hide
-                raise ValueError(f"the observation is not finite: {leaf}")
+        if not is_finite(observation):  # which normalisation would hide
+            raise ValueError(f"the observation is not finite: {observation}")
         return np.asarray(self.policy(self._as_seen(observation, sent, several)))
 
     def _as_seen(self, observation: Observation, sent: list[np.ndarray], several: bool) -> Observation:

@@ -70,6 +70,7 @@ class QuickSACPolicy(SACPolicy):
         space, activation, extractor = self.observation_space, self.activation_fn, type(self.actor.features_extractor)
         is_vector = isinstance(space, spaces.Box) and not is_image_space(space) and extractor is FlattenExtractor
         self._observation_shape: tuple[int, ...] = space.shape or ()
+        self._action_shape: tuple[int, ...] = self.action_space.shape or ()
         if self.actor.use_sde or activation is not nn.ReLU or not is_vector:
             raise ValueError(
                 f"QuickSACPolicy is for vectors, ReLU and no gSDE, not for {extractor.__name__}, {activation.__name__}, "
@@ -101,7 +102,7 @@ class QuickSACPolicy(SACPolicy):
         if not deterministic:
             log_std = _affine(self.actor.log_std, x).clip(LOG_STD_MIN, LOG_STD_MAX)
             gaussian += np.exp(log_std) * th.randn(gaussian.shape).numpy()
-        actions = self.unscale_action(np.tanh(gaussian).reshape(-1, *self.action_space.shape))  # type: ignore[misc]
+        actions = self.unscale_action(np.tanh(gaussian).reshape(-1, *self._action_shape))
         return actions if observation.ndim > n_axes else actions[0], state
 
 

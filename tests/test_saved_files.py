@@ -121,6 +121,8 @@ def test_a_replay_buffer_whose_options_mean_something_else_is_refused(tmp_path):
 
 def test_a_learned_penalty_is_the_files(tmp_path):
     CTCO("MlpPolicy", "Pendulum-v1", target_decision_rate=5.0, buffer_size=10).save(tmp_path / "model")
+    with pytest.raises(ValueError, match=r"'target_decision_rate': None.* cannot be changed while loading"):
+        CTCO.load(tmp_path / "model", target_decision_rate=None)  # not found by itself, so None is another value
     with pytest.raises(ValueError, match=r"'high_freq_penalty': 0\.003.* cannot be changed while loading"):
         CTCO.load(tmp_path / "model", high_freq_penalty=0.003)
     assert CTCO.load(tmp_path / "model", high_freq_penalty="relative_0.1").high_freq_penalty == "relative_0.1"

@@ -6,6 +6,8 @@ import gymnasium as gym
 import numpy as np
 from gymnasium import spaces
 
+from sb3_ctco.options import is_finite
+
 
 def reset_env(env: gym.Env, seed: int | None, options: dict[str, Any] | None) -> tuple[Any, dict[str, Any]]:
     """Reset an environment, and look at what it returns.
@@ -47,11 +49,3 @@ def _find_fault(obs: Any, space: spaces.Space) -> str | None:
         if not is_finite(obs):
             return f"is not finite: {obs}"
     return None
-
-
-def is_finite(obs: Any) -> bool:
-    """Whether an observation, stacked or not, or all of a dictionary of such, is finite."""
-    if isinstance(obs, dict):
-        return all(is_finite(value) for value in obs.values())
-    array = np.asarray(obs)
-    return array.dtype.kind != "f" or bool(np.isfinite(array).all())

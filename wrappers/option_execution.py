@@ -6,7 +6,6 @@ import math
 import traceback
 from collections.abc import Sequence
 from copy import deepcopy
-from pathlib import Path
 from typing import Any, Literal, SupportsFloat
 
 import gymnasium as gym
@@ -34,13 +33,14 @@ from sb3_ctco.options import (
     draw_stretches,
     fit_sub_options,
     integrated_reward,
+    is_finite,
     rows_of,
     shortest_steps,
     stack,
     with_last_action,
     with_last_action_space,
 )
-from sb3_ctco.wrappers.checks import check_observation, is_finite, reset_env
+from sb3_ctco.wrappers.checks import check_observation, reset_env
 from sb3_ctco.wrappers.real_time import refuse_other_actions
 from sb3_ctco.wrappers.reward_rate import RewardRateWrapper
 from sb3_ctco.wrappers.step_sequence import SequenceResult, StepSequence, find_step_sequence
@@ -341,9 +341,9 @@ class OptionExecutionWrapper(gym.Wrapper, RecordConstructorArgs):
             obs, rewards, terminated, truncated, info = play(actions, observe) if observe else play(actions)
         except (TypeError, ValueError) as error:
             *_, (innermost, _) = traceback.walk_tb(error.__traceback__)
-            # What fails within the environment's own step says for itself what it is.
-            is_ours = {"gymnasium", "stable_baselines3", "wrappers"} & set(Path(innermost.f_code.co_filename).parts)
-            if "unpack" not in str(error) or not is_ours:
+            # Where a wrapper unpacks what a step returned. What fails within the environment's own step says what it is.
+            package, *_ = innermost.f_globals["__name__"].split(".")
+            if "unpack" not in str(error) or package not in ("gymnasium", "stable_baselines3", "sb3_ctco"):
                 raise
             raise TypeError(
                 f"{error}, from the environment {self.env}: step must return observation, reward, terminated, truncated and "

@@ -30,6 +30,17 @@ from sb3_ctco.options import (
 )
 
 
+def refuse_normalised_rewards(env: VecNormalize | None) -> None:
+    """Options have rewards of their own, which VecNormalize does not know.
+
+    :raises ValueError: if it normalises rewards
+    """
+    if env is not None and env.norm_reward:
+        raise ValueError(
+            "VecNormalize counts its returns per decision, whatever time a decision takes: pass norm_reward=False"
+        )
+
+
 class AddedTrajectory(NamedTuple):
     """What became of a recorded trajectory, see :meth:`OptionReplayBuffer.add_trajectory`.
 
@@ -350,10 +361,7 @@ class _OptionStorage(ReplayBuffer):
         self.timeouts[rows, 0] = sub_options.truncated & ~sub_options.terminated & self.handle_timeout_termination
 
     def _sample_fields(self, batch_inds: np.ndarray, env: VecNormalize | None) -> dict[str, Any]:
-        if env is not None and env.norm_reward:
-            raise ValueError(
-                "VecNormalize counts its returns per decision, whatever time a decision takes: pass norm_reward=False"
-            )
+        refuse_normalised_rewards(env)
 
         # ReplayBuffer._get_samples of Stable-Baselines3 2.9 has no place for further fields, so it is written anew.
         def rows(stored: np.ndarray) -> np.ndarray:

@@ -40,9 +40,7 @@ def check_load_arguments(
         data, _, _ = load_from_zip_file(path, device="cpu")
         assert data is not None
         data = {**(older or {}), **data}
-        # Of what the constructor finds by itself, None stands for what it found.
-        given = [name for name in fixed if arguments[name] is not None]
-        differing = {name: arguments[name] for name in given if not _equal(arguments[name], data.get(name))}
+        differing = {name: arguments[name] for name in fixed if not _equal(arguments[name], data.get(name))}
         if differing:
             of_file = {name: data.get(name) for name in differing}
             raise ValueError(

@@ -42,7 +42,7 @@ from stable_baselines3.common.vec_env import (
     unwrap_vec_wrapper,
 )
 
-from sb3_ctco.common.buffers import DictOptionReplayBuffer, OptionReplayBuffer
+from sb3_ctco.common.buffers import DictOptionReplayBuffer, OptionReplayBuffer, refuse_normalised_rewards
 from sb3_ctco.common.callbacks import WithinRollout, as_callback, eval_callbacks, in_primitive_steps, wrap_each
 from sb3_ctco.common.load_arguments import check_load_arguments
 from sb3_ctco.option_array import OptionArray
@@ -61,6 +61,8 @@ from sb3_ctco.wrappers import OptionExecutionWrapper, find_dt
 
 #: Of how many decisions logs tell at most
 _MAX_LOGGED = 100_000
+#: Arguments for which None stands for what is found in the environment, or follows from others
+_FOUND = ("dt", "d_max", "d_min", "n_repetitions")
 
 SelfOptionOffPolicyAlgorithm = TypeVar("SelfOptionOffPolicyAlgorithm", bound="OptionOffPolicyAlgorithm")
 
@@ -244,11 +246,7 @@ class OptionOffPolicyAlgorithm(OffPolicyAlgorithm):
 
     def _check_env(self, env: VecEnv) -> OptionSpace:
         """The options' space of an environment, once they agree with the algorithm's."""
-        normalizer = unwrap_vec_normalize(env)
-        if normalizer is not None and normalizer.norm_reward:
-            raise ValueError(
-                "VecNormalize counts its returns per decision, whatever time a decision takes: pass norm_reward=False"
-            )
+        refuse_normalised_rewards(unwrap_vec_normalize(env))
         if self.n_sub_options and unwrap_vec_wrapper(env, VecFrameStack) is not None:
             raise ValueError(
                 "sub-options begin at single observations, which VecFrameStack does not stack: stack frames inside, with "
@@ -340,8 +338,8 @@ class OptionOffPolicyAlgorithm(OffPolicyAlgorithm):
         """
         saved = cls._saved_attributes(path)
         older = cls._arguments_of_older_files(saved) if saved else {}
-        if kwargs.get("dt", 0.0) is None:
-            del kwargs["dt"]  # to be found, as without it
+        # What the constructor finds by itself is as without it.
+        kwargs = {name: value for name, value in kwargs.items() if value is not None or name not in _FOUND}
         if kwargs.get("d_min") == 0.0:
             kwargs["d_min"] = saved.get("dt")  # as which it was saved
         # With a target rate β_h is learned, and the file has it.

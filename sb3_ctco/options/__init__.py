@@ -42,7 +42,16 @@ from sb3_ctco.options.space import (
     OptionSpace,
     default_durations,
 )
-from sb3_ctco.options.sub_options import Stacked, SubOptions, draw_stretches, fit_sub_options, rows_of, shortest_steps, stack
+from sb3_ctco.options.sub_options import (
+    Stacked,
+    SubOptions,
+    draw_stretches,
+    fit_sub_options,
+    is_finite,
+    rows_of,
+    shortest_steps,
+    stack,
+)
 from sb3_ctco.options.trajectory import TRAJECTORIES, BezierCurve, RadialBasis, Trajectory, basis_of_steps
 
 __all__ = [
@@ -81,6 +90,7 @@ __all__ = [
     "draw_stretches",
     "fit_sub_options",
     "integrated_reward",
+    "is_finite",
     "rows_of",
     "shortest_steps",
     "stack",

@@ -28,6 +28,14 @@ def rows_of(stacked: Stacked, rows: Any) -> Any:
     return {key: value[rows] for key, value in stacked.items()} if isinstance(stacked, dict) else stacked[rows]
 
 
+def is_finite(observation: Any) -> bool:
+    """Whether an observation, stacked or not, or all of a dictionary of such, is finite."""
+    if isinstance(observation, dict):
+        return all(is_finite(value) for value in observation.values())
+    array = np.asarray(observation)
+    return array.dtype.kind != "f" or bool(np.isfinite(array).all())
+
+
 def shortest_steps(space: OptionSpace) -> int:
     """The fewest steps that are as long as the shortest duration, at least one."""
     return max(1, math.ceil(space.d_min / space.dt - 1e-6))

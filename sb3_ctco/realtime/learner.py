@@ -22,7 +22,7 @@ from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from sb3_ctco.common.lock import lock
 from sb3_ctco.options import SubOptions
 from sb3_ctco.realtime.journal import Arrays, JournalError, JournalReader
-from sb3_ctco.realtime.weights import SharedWeights, is_finite
+from sb3_ctco.realtime.weights import SharedWeights, has_finite_weights
 
 logger = logging.getLogger(__name__)
 
@@ -183,7 +183,7 @@ class _Learner:
                 model._update_current_progress_remaining(model.num_timesteps, settings.total_timesteps)
                 model.train(gradient_steps=n_updates, batch_size=model.batch_size)
                 self.num_updates += n_updates
-                if not is_finite(model.policy):
+                if not has_finite_weights(model.policy):
                     raise RuntimeError(
                         "learning diverged, weights are not finite: go on from the checkpoint with a smaller learning_rate"
                     )
@@ -207,7 +207,7 @@ class _Learner:
 
     def save(self) -> None:
         """Write a checkpoint, in one move; nothing in place of a good one if learning diverged."""
-        if not is_finite(self.model.policy):
+        if not has_finite_weights(self.model.policy):
             return
         unfinished = self.settings.folder / "model.unfinished.zip"
         try:

@@ -37,7 +37,7 @@ from sb3_ctco.common.lock import lock
 from sb3_ctco.common.option_algorithm import OptionOffPolicyAlgorithm
 from sb3_ctco.datasets import RecordedTrajectory
 from sb3_ctco.fixed_rate import FixedRateSAC
-from sb3_ctco.options import TAKEN_OVER, ValueInterrupt
+from sb3_ctco.options import TAKEN_OVER, ValueInterrupt, is_finite
 from sb3_ctco.realtime.journal import JournalReader, JournalWriter, check_meaning, repair_journal, segments
 from sb3_ctco.realtime.learner import (
     LEARNER_LOCK,
@@ -58,7 +58,7 @@ from sb3_ctco.wrappers import (
     TakeOver,
     TakeOverWrapper,
 )
-from sb3_ctco.wrappers.checks import check_observation, reset_env
+from sb3_ctco.wrappers.checks import reset_env
 
 logger = logging.getLogger(__name__)
 
@@ -191,8 +191,8 @@ class AsynchronousTrainer(Generic[AlgorithmType]):
         self._demonstration_folder = self.folder / "demonstrations"
         self._demonstrations: JournalWriter | None = None
         self._take_over: TakeOverWrapper | None = None
-        made = self._journal_folder.exists() or (self.folder / "model.zip").exists()
-        if not resume and (made or segments(self._demonstration_folder)):
+        earlier = self._journal_folder.exists() or segments(self._demonstration_folder) or (self.folder / "model.zip").exists()
+        if earlier and not resume:
             raise FileExistsError(
                 f"{self.folder} holds the experience of an earlier run: pass resume=True to continue it, or another folder"
             )
@@ -632,12 +632,7 @@ class _Supervisor(gym.Wrapper):
         if self.check is not None:
             self.check()
         self.has_commanded = self.has_stepped = True
-        obs, reward, terminated, truncated, info = self.env.step(action)
-        # What is in the journal is learned from, again and again.
-        check_observation(self.env, obs)
-        if not math.isfinite(reward):
-            raise ValueError(f"the environment {self.env} returned the reward {reward}, which is not finite")
-        return obs, reward, terminated, truncated, info
+        return self.env.step(action)
 
 
 class _JournalBuffer:
@@ -650,6 +645,9 @@ class _JournalBuffer:
     def add(self, obs: Any, next_obs: Any, action: Any, reward: Any, done: Any, infos: list[dict[str, Any]]) -> None:
         if infos[0].get(TAKEN_OVER):
             return  # its option is not what was played
+        # What is in the journal is learned from, by each training that goes on with it.
+        if not (is_finite(next_obs) and np.isfinite(reward).all()):
+            raise ValueError(f"the environment returned what is not finite: the observation {next_obs}, the reward {reward}")
         # Stable-Baselines3 hands over arrays of its own, except for the observations, which the next step writes over.
         transition = Transition(_copy(obs), _copy(next_obs), action, reward, done, infos, self._model.num_timesteps)
         self._journal.add(transition.to_arrays(), transition.n_rows)

@@ -76,7 +76,7 @@ class SharedWeights:
         return time.monotonic() - self._seen_published_at
 
 
-def is_finite(module: nn.Module) -> bool:
+def has_finite_weights(module: nn.Module) -> bool:
     """Whether all weights of a module are numbers."""
     return all(bool(th.isfinite(weights).all()) for weights in module.parameters())
 

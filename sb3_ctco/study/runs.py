@@ -9,6 +9,7 @@ import platform
 import subprocess
 import time
 import traceback
+from collections import defaultdict
 from collections.abc import Sequence
 from dataclasses import dataclass
 from importlib import metadata
@@ -54,28 +55,30 @@ def plan(runs: Sequence[Run], folder: Path) -> None:
     :raises ValueError: if a folder has other settings, also of another seed, since seeds make one mean, or cannot be made
     """
     try:
-        # One seed of each cell will do, since the others were compared with it when they were planned.
-        there: dict[tuple[Any, ...], tuple[dict[str, Any], Path]] = {}
-        for file in sorted(folder.glob(f"*/{SETTINGS}")):
-            if (file.parent / RECORD).exists() or not (file.parent / ERROR).exists():
-                found = read_json(file)
-                there[tuple(found.get(name) for name in _CELL)] = found, file
+        there = {file: read_json(file) for file in sorted(folder.glob(f"*/{SETTINGS}")) if not _has_failed(file.parent)}
+        cells: dict[tuple[Any, ...], list[Path]] = defaultdict(list)
+        for file, found in there.items():
+            cells[tuple(found.get(name) for name in _CELL)].append(file)
         for run in runs:
             file = folder / run.name / SETTINGS
-            cell = tuple(getattr(run, name) for name in _CELL)
-            if cell in there:
-                found, of_cell = there[cell]
-                of_the_same_seed = dataclasses.replace(run, preset=found["preset"], seed=found["seed"])
-                _refuse_other_settings(of_the_same_seed, found, of_cell)
-            if file.exists() and ((file.parent / RECORD).exists() or not (file.parent / ERROR).exists()):
-                _refuse_other_settings(run, read_json(file), file)
-            else:
+            if file in there:
+                _refuse_other_settings(run, there[file], file)
+            for other in cells[tuple(getattr(run, name) for name in _CELL)]:
+                of_its_seed = dataclasses.replace(run, preset=there[other]["preset"], seed=there[other]["seed"])
+                _refuse_other_settings(of_its_seed, there[other], other)
+        for run in runs:
+            file = folder / run.name / SETTINGS
+            if file not in there:
                 file.parent.mkdir(parents=True, exist_ok=True)
                 write_whole(file, json.dumps(run.as_dict(), indent=1) + "\n")
     except OSError as error:
         raise ValueError(
             f"{folder} cannot be the study's folder: {error}. Name another --folder, one that can be written to"
         ) from error
+
+
+def _has_failed(path: Path) -> bool:
+    return (path / ERROR).exists() and not (path / RECORD).exists()
 
 
 def read_json(file: Path) -> dict[str, Any]:

@@ -181,10 +181,15 @@ def frequency_averaged(scores: dict[Line, dict[int, np.ndarray]]) -> dict[Line, 
     averaged = {}
     for line, of_rates in scores.items():
         if set(of_rates) == rates:
-            n_seeds = min(len(matrix) for matrix in of_rates.values())
+            n_seeds = seeds_at_each_rate(of_rates)
             mean = np.mean([matrix[:n_seeds] for matrix in of_rates.values()], axis=0)
             averaged[line] = _estimate(aggregate_iqm, mean)
     return averaged
+
+
+def seeds_at_each_rate(of_rates: dict[int, np.ndarray]) -> int:
+    """How many seeds there are at each of a line's rates, of relative scores."""
+    return min(map(len, of_rates.values()))
 
 
 def improvement(scores: dict[Line, dict[int, np.ndarray]], of: Line) -> dict[Line, dict[int, tuple[float, float, float]]]:

@@ -14,6 +14,7 @@ from sb3_ctco.study.scores import (
     frequency_averaged,
     mean_and_interval,
     rate_of,
+    seeds_at_each_rate,
     seeds_in_words,
     tasks_of,
 )
@@ -85,8 +86,8 @@ def averaged_table(scores: dict[Line, dict[int, np.ndarray]]) -> str:
     """Markdown: scores averaged over rates."""
     rows = [_row("algorithm", "setting", "seeds", "score"), _row(*["---"] * 4)]
     for (algorithm, setting), estimate in frequency_averaged(scores).items():
-        n_seeds = min(len(matrix) for matrix in scores[algorithm, setting].values())
-        rows.append(_row(ALGORITHMS[algorithm].label, setting, str(n_seeds), _interval_cell(estimate)))
+        n_seeds = str(seeds_at_each_rate(scores[algorithm, setting]))
+        rows.append(_row(ALGORITHMS[algorithm].label, setting, n_seeds, _interval_cell(estimate)))
     caption = (
         "Interquartile mean, over tasks and seeds, of the mean over rates of return by the best mean return at any rate. Of "
         "as many seeds, the first ones, as there are at each rate; who lacks a rate is left out."
