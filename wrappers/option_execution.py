@@ -113,7 +113,7 @@ class OptionExecutionWrapper(gym.Wrapper, RecordConstructorArgs):
     def __init__(
         self,
         env: gym.Env,
-        n_rbf: int = 3,
+        n_rbf: int = 2,
         d_max: float | None = None,
         d_min: float | None = None,
         dt: float | None = None,

@@ -152,7 +152,7 @@ class CTCO(SoftOptionActorCritic):
         gradient_steps: int = -1,
         updates_per_second: float | None = None,
         n_sub_options: int = 8,
-        n_rbf: int = 3,
+        n_rbf: int = 2,
         d_max: float | None = None,
         d_min: float | None = None,
         dt: float | None = None,
