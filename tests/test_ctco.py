@@ -172,11 +172,11 @@ def test_the_price_of_a_decision_is_the_penalty_alone(scripted_env):
 
 def test_a_decision_is_never_paid_for_its_entropy():
     """Relative to the uniform distribution the expected cost is a KL divergence, at least 0."""
-    model = make(random_walk_like(), ent_coef=1.0, entropy_reference="uniform")
+    model = make(random_walk_like(), n_rbf=3, ent_coef=1.0, entropy_reference="uniform")
     _, log_prob = model.actor.option_log_prob(th.zeros(4096, 2))
     assert model.entropy_costs(log_prob @ model._parts).mean() > -0.05
     # With the paper's density the same policy is paid at each decision.
-    model = make(random_walk_like(), ent_coef=1.0, entropy_reference="paper", duration_scale="linear")
+    model = make(random_walk_like(), n_rbf=3, ent_coef=1.0, entropy_reference="paper", duration_scale="linear")
     assert model.entropy_costs(log_prob @ model._parts).mean() < -0.5
 
 
@@ -507,13 +507,13 @@ def test_a_decision_rate_is_kept_from_above_only():
 
 
 def test_target_entropies_may_be_schedules(random_walk_env):
-    # 4 at the beginning, −4 in the end, of three weights and d
-    model = make(random_walk_env(), target_entropy=lambda remaining: 8 * remaining - 4)
-    assert model._target_entropies.tolist() == [1.0, 1.0, 1.0, 1.0]
+    # 3 at the beginning, −3 in the end, of two weights and d
+    model = make(random_walk_env(), target_entropy=lambda remaining: 6 * remaining - 3)
+    assert model._target_entropies.tolist() == [1.0, 1.0, 1.0]
     model.learn(200)
     model._current_progress_remaining = 0.25
     model.train(1, 8)
-    assert model._target_entropies.tolist() == [-0.5, -0.5, -0.5, -0.5]
+    assert model._target_entropies.tolist() == [-0.5, -0.5, -0.5]
     with pytest.raises(ValueError, match="target_entropy must be a number, a function of the remaining progress or 'auto'"):
         make(random_walk_env(), target_entropy="car")
 
@@ -577,8 +577,8 @@ def test_one_update_by_hand(entropy_reference, random_walk_env):
 
     def cost(log_prob):
         price = 0.2 * log_prob[:, :-1].sum(dim=1, keepdim=True) + 0.4 * log_prob[:, -1:]
-        # The density of three weights and d that are uniform over [−1, 1] is 1/2 each.
-        return price - (price.mean() if entropy_reference == "average" else (3 * 0.2 + 0.4) * math.log(0.5))
+        # The density of two weights and d that are uniform over [−1, 1] is 1/2 each.
+        return price - (price.mean() if entropy_reference == "average" else (2 * 0.2 + 0.4) * math.log(0.5))
 
     # Let the targets differ from what they follow.
     with th.no_grad():
@@ -643,16 +643,16 @@ def test_polyak_and_the_step_size(random_walk_env):
 
 def test_temperatures(random_walk_env):
     model = make(random_walk_env(), learning_starts=1000, ent_coef="auto_0.5", learning_rate=0.1)
-    assert model.target_entropy == -4.0  # ω has three entries, and d is one more
-    assert model._target_entropies.tolist() == [-1.0, -1.0, -1.0, -1.0]
+    assert model.target_entropy == -3.0  # ω has two entries, and d is one more
+    assert model._target_entropies.tolist() == [-1.0, -1.0, -1.0]
     model.learn(60)
-    assert model.log_ent_coefs.detach().exp().tolist() == pytest.approx([0.5, 0.5, 0.5, 0.5])
+    assert model.log_ent_coefs.detach().exp().tolist() == pytest.approx([0.5, 0.5, 0.5])
     model.train(1, 8)
     # A new policy is far more random than its target: its temperatures fall by Adam's first step.
-    assert model.log_ent_coefs.detach().tolist() == pytest.approx([math.log(0.5) - 0.1] * 4, abs=1e-4)
+    assert model.log_ent_coefs.detach().tolist() == pytest.approx([math.log(0.5) - 0.1] * 3, abs=1e-4)
     for ent_coef in (0, 0.0, 0.3):
         model = make(random_walk_env(), ent_coef=ent_coef).learn(60)
-        assert model.ent_coefs.tolist() == pytest.approx([ent_coef] * 4)  # A number stays.
+        assert model.ent_coefs.tolist() == pytest.approx([ent_coef] * 3)  # A number stays.
         assert all(th.isfinite(p).all() for p in model.policy.parameters())
 
 
@@ -770,7 +770,7 @@ def test_a_dt_that_the_wrapper_was_given_is_the_models(random_walk_env):
 @pytest.mark.parametrize(
     ("wrapper", "algorithm", "name"),
     [
-        ({"n_rbf": 2}, {}, "n_rbf"),
+        ({"n_rbf": 3}, {}, "n_rbf"),
         ({"d_max": 0.6}, {}, "d_max"),
         ({"d_min": 0.2}, {"d_min": 0.3}, "d_min"),
         ({}, {"dt": 0.2}, "dt"),
@@ -821,7 +821,7 @@ def test_images_and_dictionaries_are_trained(random_walk_env, kind, share):
     assert isinstance(model.replay_buffer, DictOptionReplayBuffer if kind == "dict" else OptionReplayBuffer)
     assert any(not th.equal(p, q) for p, q in zip(before, model.actor.parameters(), strict=True))
     option, _ = model.predict(model.get_env().reset())
-    assert option.shape == (1, 4)
+    assert option.shape == (1, 3)
 
 
 def test_vec_normalize(random_walk_env):
@@ -834,7 +834,7 @@ def test_vec_normalize(random_walk_env):
 
 
 def test_action_noise(random_walk_env):
-    noise = NormalActionNoise(10 * np.ones(4), np.zeros(4))
+    noise = NormalActionNoise(10 * np.ones(3), np.zeros(3))
     model = make(random_walk_env(), action_noise=noise, learning_starts=0).learn(60)
     np.testing.assert_array_equal(model.replay_buffer.actions[: model.replay_buffer.size()], 1.0)
 
@@ -902,7 +902,7 @@ def test_a_bad_environment_leaves_no_trace_in_the_buffer(scripted_env, bad):
             return obs, reward, terminated, truncated, info
 
     env = Env(truncate_at=20)
-    model = make(env, d_max=0.5, duration_scale="linear", learning_starts=1000)
+    model = make(env, d_min=0.5, d_max=0.5, learning_starts=1000)  # so that an option ends at the broken step
     with pytest.raises((RuntimeError, ValueError), match=r"the motor is hot|not finite"):
         model.learn(100)
     buffer = model.replay_buffer
@@ -1028,7 +1028,7 @@ def test_ensemble_linear_is_several_linear_layers():
 
 def test_one_critic_on_request(random_walk_env):
     model = make(random_walk_env(), policy_kwargs={"net_arch": [8], "n_critics": 1}).learn(40)
-    assert model.critic(th.zeros(5, 2), th.zeros(5, 4)).shape == (1, 5, 1)
+    assert model.critic(th.zeros(5, 2), th.zeros(5, 3)).shape == (1, 5, 1)
 
 
 def test_greedy_options_are_the_means(random_walk_env):

@@ -479,7 +479,7 @@ def test_learns_from_each_kind_of_observation(random_walk_env, tmp_path, kind, j
 
 def test_settings_of_model_and_environment_agree(random_walk_env):
     with pytest.raises(ValueError, match="the environment's options have join=continuous, CTCO has join=free"):
-        CTCO("MlpPolicy", joined(random_walk_env(), n_rbf=3, d_max=0.5), d_max=0.5, **SMALL)
+        CTCO("MlpPolicy", joined(random_walk_env(), n_rbf=2, d_max=0.5), d_max=0.5, **SMALL)
     arguments = {"join": "continuous", "gamma": 0.98, "gamma_dt": 0.05, "d_max": 0.4}
     assert CTCO.wrapper_kwargs(arguments)["join"] == "continuous"
     figar = {"gamma": 0.98, "gamma_dt": 0.05, "d_max": 0.4, "n_repetitions": None, "dt": None}
@@ -488,7 +488,7 @@ def test_settings_of_model_and_environment_agree(random_walk_env):
 
 @pytest.mark.parametrize("vec_env_cls", [DummyVecEnv, AsyncOptionVecEnv])
 def test_several_environments(random_walk_env, vec_env_cls):
-    kwargs = {"n_rbf": 3, "d_max": 0.5, "join": "continuous"}
+    kwargs = {"n_rbf": 2, "d_max": 0.5, "join": "continuous"}
     env = make_vec_env(
         random_walk_env, 2, wrapper_class=OptionExecutionWrapper, wrapper_kwargs=kwargs, vec_env_cls=vec_env_cls, seed=0
     )

@@ -104,7 +104,7 @@ def test_one_option_is_an_array_to_look_at(random_walk_env):
     np.testing.assert_array_equal(option, again)
     np.testing.assert_allclose(option, again)
     assert np.array_equal(option, again) and (option == again).all() and type(option == again) is np.ndarray
-    assert np.stack([option, again]).shape == (2, 4) and type(np.stack([option, again])) is np.ndarray
+    assert np.stack([option, again]).shape == (2, 3) and type(np.stack([option, again])) is np.ndarray
     assert type(option.vector) is type(np.asarray(option)) is np.ndarray
     np.testing.assert_array_equal(pickle.loads(pickle.dumps(option)), option)
     np.testing.assert_array_equal(copy.deepcopy(option), option)
@@ -113,7 +113,7 @@ def test_one_option_is_an_array_to_look_at(random_walk_env):
     file.seek(0)
     np.testing.assert_array_equal(np.load(file), option.vector)
     assert str(option) == str(option.vector) and repr(option).startswith("OptionArray([")
-    assert th.as_tensor(option).shape == (4,)
+    assert th.as_tensor(option).shape == (3,)
     np.testing.assert_array_equal(env.plan(option), env.plan(option.vector))
     from_vector = model.wrap_env(random_walk_env())
     from_vector.reset(seed=0)
@@ -123,7 +123,7 @@ def test_one_option_is_an_array_to_look_at(random_walk_env):
 def test_several_options_are_an_array_of_options(random_walk_env):
     model = CTCO("MlpPolicy", random_walk_env(), **SMALL)
     options, _ = model.predict(np.zeros((3, 2), np.float32), deterministic=True)
-    assert options.shape == (3, 4) and type(options * 2) is np.ndarray and type(np.clip(options, -1, 1)) is np.ndarray
+    assert options.shape == (3, 3) and type(options * 2) is np.ndarray and type(np.clip(options, -1, 1)) is np.ndarray
     assert type(options[:, -1]) is type(options[:2]) is np.ndarray
     assert [type(row) for row in options] == [Option] * 3
     np.testing.assert_array_equal(options[1].vector, options.vector[1])

@@ -455,7 +455,7 @@ def test_monitor_counts_primitive_steps():
 def test_evaluate_policy_reports_primitive_steps():
     class RandomPolicy:
         def predict(self, obs, state=None, episode_start=None, deterministic=False):
-            return np.zeros((1, 4), dtype=np.float32), None
+            return np.zeros((1, 3), dtype=np.float32), None
 
     env = make_vec_env("Pendulum-v1", wrapper_class=OptionExecutionWrapper)
     _, lengths = evaluate_policy(RandomPolicy(), env, n_eval_episodes=2, return_episode_rewards=True)
@@ -615,4 +615,4 @@ def test_a_fault_of_the_environments_own_says_what_it_is(scripted_env):
     env = OptionExecutionWrapper(Faulty())
     env.reset()
     with pytest.raises(ValueError, match=r"^not enough values to unpack \(expected 2, got 1\)$"):
-        env.step(np.zeros(4))
+        env.step(np.zeros(3))

@@ -444,7 +444,7 @@ _REFUSED = {
     "d_max": 0.6,
     "d_min": 0.2,
     "dt": 0.05,  # of DAC-PPO alone: a policy of options may run at another rate
-    "n_rbf": 2,
+    "n_rbf": 3,
     "n_repetitions": 7,
     "ent_coef": 0.7,
     "duration_ent_coef": 0.7,
