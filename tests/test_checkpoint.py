@@ -83,7 +83,7 @@ def test_in_the_middle_of_an_episode(tmp_path, name):
     [
         {"target_decision_rate": 5.0},
         {"updates_per_second": 3.3},
-        {"action_noise": OrnsteinUhlenbeckActionNoise(np.zeros(4), np.full(4, 0.2))},
+        {"action_noise": OrnsteinUhlenbeckActionNoise(np.zeros(3), np.full(3, 0.2))},
         {"ent_coef": 0.1, "learning_rate": lambda remaining: 1e-3 * remaining},
     ],
     ids=", ".join,

@@ -92,9 +92,9 @@ def test_one_basis_function_is_exact(scripted_env):
 def test_replayed_a_sub_option_lands_in_the_same_state():
     """In a deterministic environment, from where it began, up to what its residual does."""
     env = OptionExecutionWrapper(
-        gym.make("sb3_ctco/point_mass-easy-v0", dt=0.01), d_max=0.5, n_sub_options=8, sub_option_tolerance=0.05
+        gym.make("sb3_ctco/point_mass-easy-v0", dt=0.01), n_rbf=3, d_max=0.5, n_sub_options=8, sub_option_tolerance=0.05
     )
-    again = OptionExecutionWrapper(gym.make("sb3_ctco/point_mass-easy-v0", dt=0.01, time_limit=1e6), d_max=0.5)
+    again = OptionExecutionWrapper(gym.make("sb3_ctco/point_mass-easy-v0", dt=0.01, time_limit=1e6), n_rbf=3, d_max=0.5)
     again.reset(seed=0)
     errors, moved = [], []
     for sub, *_ in itertools.islice(play(env), 60):
@@ -341,7 +341,7 @@ class MovingImages(gym.ObservationWrapper):
 @pytest.mark.parametrize("kind", ["image", "dict"])
 @pytest.mark.parametrize("algorithm", ["SAC", "CTCO"])
 def test_images_with_channels_last_are_transposed_and_not_reshaped(random_walk_env, kind, algorithm):
-    env = OptionExecutionWrapper(MovingImages(random_walk_env(kind)), n_rbf=3, d_max=1.0, n_sub_options=4)
+    env = OptionExecutionWrapper(MovingImages(random_walk_env(kind)), d_max=1.0, n_sub_options=4)
     policy = "CnnPolicy" if kind == "image" else "MultiInputPolicy"
     if algorithm == "SAC":
         buffer_class = OptionReplayBuffer if kind == "image" else DictOptionReplayBuffer
@@ -374,7 +374,7 @@ class Shifted(VecEnvWrapper):
 
 
 def wrapped(env):
-    return OptionExecutionWrapper(env, n_rbf=3, d_max=1.0, n_sub_options=4)
+    return OptionExecutionWrapper(env, d_max=1.0, n_sub_options=4)
 
 
 @pytest.mark.parametrize(

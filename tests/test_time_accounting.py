@@ -308,9 +308,9 @@ def test_schedules_are_of_numbers_from_one_to_zero(random_walk_env):
 
 def test_noise_is_of_options(random_walk_env):
     noise = NormalActionNoise(np.zeros(1), np.ones(1))
-    with pytest.raises(ValueError, match=r"action_noise has the shape \(1,\): it is added to options, \(4,\) numbers"):
+    with pytest.raises(ValueError, match=r"action_noise has the shape \(1,\): it is added to options, \(3,\) numbers"):
         make(random_walk_env(), action_noise=noise).learn(20)
-    make(random_walk_env(), action_noise=NormalActionNoise(np.zeros(4), np.ones(4))).learn(20)
+    make(random_walk_env(), action_noise=NormalActionNoise(np.zeros(3), np.ones(3))).learn(20)
 
 
 def test_learning_goes_on_after_somebody_else_used_the_environment(random_walk_env):

@@ -94,7 +94,7 @@ def test_an_episode_a_file_and_a_progress_bar(tmp_path, capsys):
     wrapped = OptionExecutionWrapper(env, d_max=0.2)
     play(wrapped)
     wrapped.reset()
-    wrapped.step(np.ones(4))
+    wrapped.step(np.ones(3))
     wrapped.close()
     assert sorted(path.name for path in (tmp_path / "new").iterdir()) == ["run-0.mp4", "run-1.mp4"]
     assert "filming" in capsys.readouterr().err
