@@ -246,7 +246,7 @@ def collected(tmp_path_factory):
     [
         (CTCO, {"d_max": 0.4}, r"options={.*'d_max': 0.5.*} there, {.*'d_max': 0.4.*} here"),
         (CTCO, {"gamma": 0.9}, "'discount_rate'"),
-        (CTCO, {"n_rbf": 2}, "'n_rbf': 3.*'n_rbf': 2"),
+        (CTCO, {"n_rbf": 3}, "'n_rbf': 2.*'n_rbf': 3"),
         (SAC, {}, "algorithm='CTCO' there, 'SAC' here; options="),
     ],
 )
