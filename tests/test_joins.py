@@ -488,7 +488,7 @@ def test_settings_of_model_and_environment_agree(random_walk_env):
 
 @pytest.mark.parametrize("vec_env_cls", [DummyVecEnv, AsyncOptionVecEnv])
 def test_several_environments(random_walk_env, vec_env_cls):
-    kwargs = {"n_rbf": 2, "d_max": 0.5, "join": "continuous"}
+    kwargs = {"d_max": 0.5, "join": "continuous"}
     env = make_vec_env(
         random_walk_env, 2, wrapper_class=OptionExecutionWrapper, wrapper_kwargs=kwargs, vec_env_cls=vec_env_cls, seed=0
     )
