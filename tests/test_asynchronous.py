@@ -14,6 +14,7 @@ import textwrap
 import threading
 import time
 from pathlib import Path
+from types import SimpleNamespace
 
 import gymnasium as gym
 import numpy as np
@@ -1223,7 +1224,10 @@ def test_an_interrupt_that_would_end_the_process_makes_the_machine_safe(tmp_path
 
 
 class BrokenSensor(Point):
-    """Returns one observation, or one reward, that is no number."""
+    """Returns observations, or rewards, that are no numbers, from its 60th step on.
+
+    One observation alone may be one that nothing is learned from: within an option, some are left out.
+    """
 
     def __init__(self, obs=0.0, reward=0.0):
         super().__init__()
@@ -1231,7 +1235,7 @@ class BrokenSensor(Point):
 
     def step(self, action):
         obs, reward, *rest = super().step(action)
-        if len(self.commands) == 60:
+        if len(self.commands) >= 60:
             obs, reward = obs + np.float32(self.fault[0]), reward + self.fault[1]
         return obs, reward, *rest
 
@@ -1249,6 +1253,36 @@ def test_what_is_not_finite_is_not_learned_from(tmp_path, algorithm, fault):
     for transition in records_of(tmp_path):
         assert np.isfinite(transition.next_obs).all()
         assert np.isfinite(transition.reward).all()
+
+
+class LateReport:
+    """A pipe's end whose messages arrive just after somebody stopped waiting for them."""
+
+    def __init__(self, *messages):
+        self.messages, self.was_waited_for = list(messages), False
+
+    def poll(self, timeout):
+        if timeout > 0:
+            self.was_waited_for = True
+            return False
+        return self.was_waited_for and bool(self.messages)
+
+    def recv(self):
+        return self.messages.pop(0)
+
+
+@pytest.mark.parametrize("messages", [[("ready", None)], [("ready", None), ("log", {"a": 1.0})]])
+def test_a_learner_that_is_ready_at_any_moment_is_heard(monkeypatch, messages):
+    monkeypatch.setattr(trainer_module, "_START_SECONDS", 0.5)
+    link = trainer_module._Link(SimpleNamespace(exitcode=None), LateReport(*messages), None, None)
+    link.wait_until_ready()
+
+
+def test_a_learner_that_never_is_ready(monkeypatch):
+    monkeypatch.setattr(trainer_module, "_START_SECONDS", 0.05)
+    link = trainer_module._Link(SimpleNamespace(exitcode=None), LateReport(), None, None)
+    with pytest.raises(LearnerError, match="did not start"):
+        link.wait_until_ready()
 
 
 def test_a_folder_with_the_model_of_an_earlier_run_is_refused(tmp_path):

@@ -690,15 +690,16 @@ class _Link:
         self.weights = weights
         self.model = model
         self.log: dict[str, float] = {}
+        self._is_ready = False
         self._failure: str | None = None
 
     def wait_until_ready(self) -> None:
         deadline = time.monotonic() + _START_SECONDS
-        while time.monotonic() < deadline:
-            if self.report.poll(0.1) and self._read() == "ready":
-                return
+        while not self._is_ready:
+            if time.monotonic() >= deadline:
+                raise LearnerError(f"the learner did not start within {_START_SECONDS:.0f} s")
+            self.report.poll(0.1)
             self.check()
-        raise LearnerError(f"the learner did not start within {_START_SECONDS:.0f} s")
 
     def check(self) -> None:
         """Raise if the learner has failed or gone."""
@@ -737,7 +738,9 @@ class _Link:
             kind, content = self.report.recv()
         except EOFError:
             return None
-        if kind == "log":
+        if kind == "ready":
+            self._is_ready = True
+        elif kind == "log":
             self.log = content
         elif kind == "failed":
             self._failure = self._failure or f"the learner failed:\n{content}"
