@@ -597,6 +597,8 @@ def test_collect_merges_and_skip_records_skips(finished, tmp_path, capsys):
     shutil.copytree(folder, part)
     for path in part.glob("*seed1"):
         (path / "record.json").unlink()
+    into.parent.mkdir()
+    into.write_text(",".join(COLUMNS) + "\n")  # a table without rows
     assert collect([part], into) == (1, 1)
     elsewhere = str(tmp_path / "elsewhere")
     assert main(["run", "--preset", preset, "--folder", elsewhere, "--skip-records", str(into), "--workers", "1"]) == 0

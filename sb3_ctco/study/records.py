@@ -101,7 +101,8 @@ def collect(folders: Sequence[Path], into: Path) -> tuple[int, int]:
     """
     if into.is_dir():
         raise ValueError(f"{into} is a folder: name a CSV file")
-    merged = {key(record): record for record in read_records(into)} if into.exists() else {}
+    # It may have no rows yet, but its columns.
+    merged = {key(record): record for record in _read_csv(into, COLUMNS)} if into.exists() else {}
     curves = _by_run(read_curves(into))
     n_before = len(merged)
     for folder in folders:
