@@ -74,11 +74,11 @@ def main() -> None:
         with AsynchronousTrainer(
             model, env, args.folder, resume=journal.exists(), updates_per_second=UPDATES_PER_SECOND
         ) as trainer:
-            trainer.learn(n_steps, training, progress_bar=True)
+            trainer.learn(n_steps, training)
             print(trainer.real_time.total_statistics)
     else:
         model = make_model(env, args.rate, args.seed, updates_per_second=UPDATES_PER_SECOND)
-        model.learn(n_steps, training, progress_bar=True)
+        model.learn(n_steps, training)
         args.folder.mkdir(parents=True, exist_ok=True)
         model.save(args.folder / "model")
     if training.episodes:  # none if everything had been learned before
