@@ -39,7 +39,7 @@ def main() -> None:
     print("| observations | bytes a transition | measured | 100,000 transitions [GB] |\n|---|---|---|---|")
     for name, (space, action_dim) in SPACES.items():
         cls = DictOptionReplayBuffer if isinstance(space, spaces.Dict) else OptionReplayBuffer
-        option_dim = 3 * action_dim + 1
+        option_dim = 2 * action_dim + 1
         before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
         buffer = cls(args.filled, space, spaces.Box(-1, 1, (option_dim,)), device="cpu")
         for _ in range(args.filled // 100):
