@@ -1,10 +1,10 @@
-"""Memory of the replay buffer: bytes a transition, by its arrays and by what the process grows when they are filled.
+"""Memory of the replay buffer: bytes a transition, by its arrays and by all that is allocated for them.
 
 python benchmarks/memory.py
 """
 
 import argparse
-import resource
+import tracemalloc
 
 import numpy as np
 from gymnasium import spaces
@@ -40,13 +40,14 @@ def main() -> None:
     for name, (space, action_dim) in SPACES.items():
         cls = DictOptionReplayBuffer if isinstance(space, spaces.Dict) else OptionReplayBuffer
         option_dim = 2 * action_dim + 1
-        before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+        tracemalloc.start()
         buffer = cls(args.filled, space, spaces.Box(-1, 1, (option_dim,)), device="cpu")
         for _ in range(args.filled // 100):
             buffer._add_sub_options(rows_of_ones(space, option_dim, 100))
-        grown = (resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before) * 1024
+        allocated, _ = tracemalloc.get_traced_memory()
+        tracemalloc.stop()
         size = buffer.bytes_per_transition
-        print(f"| {name} | {size:,} | {grown / args.filled:,.0f} | {size * 1e5 / 1e9:.2f} |")
+        print(f"| {name} | {size:,} | {allocated / args.filled:,.0f} | {size * 1e5 / 1e9:.2f} |")
 
 
 if __name__ == "__main__":
