@@ -1,7 +1,6 @@
 """Interrupt a training, and go on in another process as if nothing had happened."""
 
 import io
-import os
 import pathlib
 import pickle
 import random
@@ -17,6 +16,8 @@ from stable_baselines3 import HerReplayBuffer
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.type_aliases import GymEnv
 from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv, VecEnvWrapper
+
+from sb3_ctco.common.files import replace_durably
 
 SelfAlgorithm = TypeVar("SelfAlgorithm", bound=BaseAlgorithm)
 
@@ -61,7 +62,7 @@ def save_checkpoint(model: BaseAlgorithm, path: str | pathlib.Path) -> None:
     unfinished = path.with_name(f"{path.name}.unfinished")
     with unfinished.open("wb") as file:
         cloudpickle.dump(state, file, protocol=pickle.HIGHEST_PROTOCOL)
-    os.replace(unfinished, path)
+    replace_durably(unfinished, path)
 
 
 def load_checkpoint(

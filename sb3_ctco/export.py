@@ -1,6 +1,5 @@
 """Write a policy to a file that runs without PyTorch."""
 
-import os
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -10,6 +9,7 @@ from gymnasium import spaces
 from stable_baselines3.common.vec_env import VecNormalize
 from torch import nn
 
+from sb3_ctco.common.files import replace_durably
 from sb3_ctco.controller import ModelPolicy
 from sb3_ctco.exported import METADATA_KEY, to_metadata
 
@@ -118,7 +118,7 @@ def export_onnx(
         entry = file.metadata_props.add()
         entry.key, entry.value = METADATA_KEY, metadata
         onnx.save(file, unfinished)
-        os.replace(unfinished, path)
+        replace_durably(unfinished, path)
     finally:
         model.policy.set_training_mode(was_training)
         unfinished.unlink(missing_ok=True)

@@ -1,9 +1,12 @@
 """Options on a machine that does not wait: decided ahead of time, and interrupted when the world changes."""
 
 import math
+import weakref
 from collections.abc import Callable, Sequence
-from concurrent.futures import Future, ThreadPoolExecutor, wait
+from concurrent.futures import Future, wait
 from copy import deepcopy
+from queue import SimpleQueue
+from threading import Thread
 from typing import Any, SupportsFloat
 
 import gymnasium as gym
@@ -29,6 +32,40 @@ from sb3_ctco.options import (
 from sb3_ctco.wrappers.option_execution import ON_THE_WAY, OptionExecutionWrapper
 from sb3_ctco.wrappers.real_time import RealTimeWrapper
 from sb3_ctco.wrappers.step_sequence import SequenceResult, StepSequence
+
+
+class _Player:
+    """A thread that plays the rests of options.
+
+    It is a daemon, which an executor's is not: if it waits for a machine that says nothing, Python can end all the same.
+    """
+
+    def __init__(self) -> None:
+        self._queue: SimpleQueue[Any] = SimpleQueue()
+        self._is_running = False
+        weakref.finalize(self, self._queue.put, None)
+
+    def play(self, future: "Future[Any]", function: Callable[..., Any], *args: Any) -> None:
+        if not self._is_running:
+            self._is_running = True
+            Thread(target=_work, args=(self._queue,), name="option", daemon=True).start()
+        self._queue.put((future, function, args))
+
+    def stop(self) -> None:
+        self._queue.put(None)
+        self._is_running = False
+
+
+def _work(queue: "SimpleQueue[Any]") -> None:
+    while (item := queue.get()) is not None:
+        future, function, args = item
+        if future.set_running_or_notify_cancel():
+            try:
+                future.set_result(function(*args))
+            except BaseException as error:
+                future.set_exception(error)
+        del item, future, function, args  # which hold the environment
+
 
 #: ``interrupt(observation of the last decision, observation, seconds since that one)``: whether to end the option
 Interrupt = Callable[[Any, Any, float], bool]
@@ -84,7 +121,7 @@ class RealTimeOptionWrapper(OptionExecutionWrapper):
                 f"decide_ahead must be at least 0 s and less than d_max={self.option_space.d_max} s, not {decide_ahead}"
             )
         self._ahead_steps = round(decide_ahead / self.option_space.dt)
-        self._executor = ThreadPoolExecutor(1, thread_name_prefix="option") if background else None
+        self._player = _Player() if background else None
         self._rest: np.ndarray | None = None
         self._commands: list[np.ndarray] = []
         #: What was sent, and before it the last two actions that were sent before
@@ -183,7 +220,8 @@ class RealTimeOptionWrapper(OptionExecutionWrapper):
         self._play = None
         self._rest = None
         # Whatever it raised is of no interest any more.
-        has_ended = self._playing_rest is None or not wait([self._playing_rest], timeout).not_done
+        rest = self._playing_rest
+        has_ended = rest is None or rest.cancel() or not wait([rest], timeout).not_done
         if has_ended:
             self._playing_rest = None
         return has_ended
@@ -191,8 +229,8 @@ class RealTimeOptionWrapper(OptionExecutionWrapper):
     def close(self) -> None:
         """Stop playing and close the environment."""
         self.abandon()
-        if self._executor is not None:
-            self._executor.shutdown()
+        if self._player is not None:
+            self._player.stop()
         super().close()
 
     def _draw_stretches(self, n_steps: int) -> list[tuple[int, int]]:
@@ -228,8 +266,12 @@ class RealTimeOptionWrapper(OptionExecutionWrapper):
         result[4][ON_THE_WAY] = seen, sent
         if not over and n_now < len(plan):
             self._rest = plan[n_now:]
-            if self._executor is not None:
-                self._playing_rest = self._executor.submit(self._play_until_interrupted, self._rest)
+            if self._player is not None:
+                # The environment may write into its array while the thread steps it.
+                result = (deepcopy(result[0]), *result[1:])
+                # Known before it begins, so that who abandons does not miss it.
+                self._playing_rest = Future()
+                self._player.play(self._playing_rest, self._play_until_interrupted, self._rest)
         return result
 
     def _finish_rest(self) -> SequenceResult | None:

@@ -34,7 +34,10 @@ def lock(path: Path, patience: float = 0.5, name: str = LOCK) -> Iterator[bool]:
                     return
                 time.sleep(0.05)
             else:
-                yield True
+                try:
+                    yield True
+                finally:
+                    _unlock(file)
                 return
 
 
@@ -49,3 +52,16 @@ def _flock(file: IO[str]) -> None:
         import fcntl
 
         fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+
+
+def _unlock(file: IO[str]) -> None:
+    """Let go of it even if a process that was forked meanwhile has the file open, too."""
+    if sys.platform == "win32":
+        import msvcrt
+
+        file.seek(0)
+        msvcrt.locking(file.fileno(), msvcrt.LK_UNLCK, 1)
+    else:
+        import fcntl
+
+        fcntl.flock(file, fcntl.LOCK_UN)

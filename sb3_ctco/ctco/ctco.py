@@ -59,13 +59,13 @@ class CTCO(SoftOptionActorCritic):
     IROS 2023, https://arxiv.org/abs/2212.04407
 
     Where it differs from the paper, the paper's way is an argument away, and :meth:`paper_defaults` has those that the paper
-    gives a value of: Bézier curves (``trajectory="rbf"``), durations on a logarithmic scale (``duration_scale="linear"``) from
-    a shortest one that follows from the discount (``d_min=0`` is one step), two weights an action dimension (``n_rbf=3``),
-    sub-options (``n_sub_options=0``), a relative β_h (``high_freq_penalty=0.05``), entropy relative to its average (``entropy_reference="paper"``, with linear durations),
-    learned temperatures (``ent_coef`` as a number, the paper's β_E) and two critics
-    (``policy_kwargs=dict(n_critics=1)``). One thing has no argument: ω is squashed by tanh, so that actions stay in their
-    bounds. The class's own settings were measured to learn more on cheetah run and ball in cup, and two weights more than three
-    on sparse point mass and cheetah run at 500 Hz.
+    gives a value of: Bézier curves (``trajectory="rbf"``), two weights for each number of an action (``n_rbf=3``), durations
+    on a logarithmic scale (``duration_scale="linear"``) from a shortest one that follows from the discount (``d_min=0`` is one
+    step), sub-options (``n_sub_options=0``), a relative β_h (``high_freq_penalty=0.05``), entropy relative to its average
+    (``entropy_reference="paper"``, with linear durations), learned temperatures (``ent_coef`` as a number, the paper's β_E)
+    and two critics (``policy_kwargs=dict(n_critics=1)``). One thing has no argument: ω is squashed by tanh, so that actions
+    stay in their bounds. The class's own settings were measured to learn more on cheetah run and ball in cup, and two weights
+    more than three on sparse point mass and cheetah run at 500 Hz.
 
     Steps are primitive environment steps everywhere.
 

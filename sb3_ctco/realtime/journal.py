@@ -31,6 +31,8 @@ from typing import Any, BinaryIO
 
 import numpy as np
 
+from sb3_ctco.common.files import replace_durably
+
 logger = logging.getLogger(__name__)
 
 #: Of the format; a journal of another version is refused
@@ -139,11 +141,8 @@ class JournalWriter:
         path = self.folder / f"{self._number:06d}.journal"
         unfinished = path.with_suffix(".unfinished")
         # In one move, and on the disk before it, so that neither a reader nor a power cut leaves a part of a head.
-        with unfinished.open("wb") as file:
-            file.write(self._head)
-            file.flush()
-            os.fsync(file.fileno())
-        os.replace(unfinished, path)
+        unfinished.write_bytes(self._head)
+        replace_durably(unfinished, path)
         self._counts[self._number] = 0
         self._delete_old_segments()
         return path.open("ab", buffering=0)
@@ -288,7 +287,7 @@ def repair_journal(folder: str | Path) -> int:
         shutil.copy2(path, damaged)
         unfinished = path.with_suffix(".unfinished")
         unfinished.write_bytes(data[:first] + b"".join(data[start:end] for start, end in good))
-        os.replace(unfinished, path)
+        replace_durably(unfinished, path)
         logger.warning(
             "%s was damaged or cut off: %d of its %d bytes were dropped, %d records are left; the file as it was is %s",
             path,

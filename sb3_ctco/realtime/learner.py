@@ -19,6 +19,7 @@ import torch as th
 from stable_baselines3.common.logger import Logger
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 
+from sb3_ctco.common.files import replace_durably
 from sb3_ctco.common.lock import lock
 from sb3_ctco.options import SubOptions
 from sb3_ctco.realtime.journal import Arrays, JournalError, JournalReader
@@ -29,6 +30,10 @@ logger = logging.getLogger(__name__)
 #: How long a round of updates may take, so that it can be stopped in time; in s
 _ROUND_SECONDS = 0.1
 _LOG_SECONDS = 1.0
+#: How long to wait for a learner that was left alone and saves, in s
+_LOCK_SECONDS = 10.0
+#: How much of what was collected last a checkpoint waits for, in s of reading
+_LAST_READING_SECONDS = 10.0
 #: Held while a learner lives, which may be longer than who started it
 LEARNER_LOCK = "learner.lock"
 
@@ -121,29 +126,44 @@ def run_learner(settings: LearnerSettings, weights: SharedWeights, stop: Any, re
     # whole group.
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     signal.signal(signal.SIGTERM, lambda *_: setattr(stop, "value", True))
+    if hasattr(signal, "SIGHUP") and signal.getsignal(signal.SIGHUP) != signal.SIG_IGN:
+        signal.signal(signal.SIGHUP, lambda *_: setattr(stop, "value", True))
     os.nice(settings.niceness)
     if settings.n_threads is not None:
         th.set_num_threads(settings.n_threads)
-    try:
-        learner = _Learner(settings, weights, stop, report)
-    except Exception:
-        report.send(("failed", traceback.format_exc()))
-        raise SystemExit(1) from None
     exit_code = 0
-    with lock(settings.folder, name=LEARNER_LOCK):
-        for work in (learner.run, learner.save):
+    with lock(settings.folder, _LOCK_SECONDS, LEARNER_LOCK) as learns_alone:
+        try:
+            if not learns_alone:
+                raise RuntimeError(
+                    f"another learner is at work in {settings.folder}: wait for its end, or pass another folder"
+                )
+            learner = _Learner(settings, weights, stop, report)
+            report.send(("ready", None))
+            to_do = [learner.run, learner.save]
+        except (BrokenPipeError, ConnectionResetError):
+            to_do = []  # the acting process is gone before anything was learned that a checkpoint could have
+        except Exception:
+            exit_code, to_do = 1, []
+            _tell_failure(report)
+        for work in to_do:
             try:
                 work()
             except (BrokenPipeError, ConnectionResetError):
                 pass  # the acting process is gone
             except Exception:
                 exit_code = 1
-                with contextlib.suppress(BrokenPipeError, ConnectionResetError):
-                    report.send(("failed", traceback.format_exc()))
+                _tell_failure(report)
     # Everything is on disk. The interpreter would take another second to clear its memory, and the acting process waits.
-    sys.stdout.flush()
-    sys.stderr.flush()
+    for stream in (sys.stdout, sys.stderr):
+        with contextlib.suppress(OSError):  # a terminal that was closed
+            stream.flush()
     os._exit(exit_code)
+
+
+def _tell_failure(report: Connection) -> None:
+    with contextlib.suppress(BrokenPipeError, ConnectionResetError):
+        report.send(("failed", traceback.format_exc()))
 
 
 class _Learner:
@@ -160,7 +180,6 @@ class _Learner:
 
     def run(self) -> None:
         """Alternate between reading what was collected and a short round of updates."""
-        self.report.send(("ready", None))
         parent = multiprocessing.parent_process()
         assert parent is not None
         model, settings = self.model, self.settings
@@ -169,8 +188,12 @@ class _Learner:
         started: float | None = None
         logged_at = saved_at = time.monotonic()
         updates_logged = 0
-        while not self.stop.value and parent.is_alive():
-            if max(fill_replay_buffer(model, journal, 1000) for journal in self.journals) == 1000:
+        has_caught_up = False
+        # What the parent forked may outlive it, and keep the pipe open that tells of its end.
+        while not self.stop.value and parent.is_alive() and os.getppid() == parent.pid:
+            n_read = max(fill_replay_buffer(model, journal, 1000) for journal in self.journals)
+            has_caught_up = has_caught_up or n_read < 1000
+            if not has_caught_up:
                 continue  # learning waits until all that was collected before is read
             now = time.monotonic()
             ready = model.num_timesteps > model.learning_starts and model.replay_buffer.size() > 0
@@ -202,7 +225,8 @@ class _Learner:
                 self.save()
                 saved_at = now
         # So that the checkpoint says how far acting got.
-        while fill_replay_buffer(model, self.journals[0], 1000):
+        end = time.monotonic() + _LAST_READING_SECONDS
+        while fill_replay_buffer(model, self.journals[0], 1000) and time.monotonic() < end:
             pass
 
     def save(self) -> None:
@@ -212,7 +236,7 @@ class _Learner:
         unfinished = self.settings.folder / "model.unfinished.zip"
         try:
             self.model.save(unfinished)
-            os.replace(unfinished, self.settings.folder / "model.zip")
+            replace_durably(unfinished, self.settings.folder / "model.zip")
         finally:
             # On a full disk it would take the room of what comes after it.
             unfinished.unlink(missing_ok=True)

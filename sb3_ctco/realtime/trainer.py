@@ -65,6 +65,8 @@ logger = logging.getLogger(__name__)
 SafeStop = Callable[[gym.Env], None]
 AlgorithmType = TypeVar("AlgorithmType", bound=OffPolicyAlgorithm)
 
+#: The model that the learner begins with
+_START = "start.zip"
 #: How long the learner may take to start and to read what was collected before, in s
 _START_SECONDS = 120.0
 #: How long it may take to stop and save before it is killed, in s
@@ -298,11 +300,12 @@ class AsynchronousTrainer(Generic[AlgorithmType]):
         weights = SharedWeights(acting_module(model), context)
         stop = context.RawValue(ctypes.c_bool, False)
         report, learner_end = context.Pipe(duplex=False)
+        start = self.folder / _START
+        start.unlink(missing_ok=True)  # an earlier run's
         assert model.replay_buffer is not None
         # What a replay buffer of this size has forgotten, no other one would learn from.
         journal = JournalWriter(self._journal_folder, _meaning(model), keep=model.replay_buffer.buffer_size)
         self._demonstrations = JournalWriter(self._demonstration_folder, _meaning(model))
-        start = self.folder / "start.zip"
         model.save(start)
         settings = LearnerSettings(type(model), start, self.folder, total_timesteps, **self._settings)
         process = context.Process(target=run_learner, args=(settings, weights, stop, learner_end), name="learner", daemon=True)
@@ -322,13 +325,17 @@ class AsynchronousTrainer(Generic[AlgorithmType]):
                     with _prompt_threads(), _scheduled(self.acting_priority):
                         self._act(in_between, journal, remaining, callbacks, log_interval, tb_log_name, progress_bar)
                 finally:
-                    none_more()
-                    self._supervisor.check = None
-                    self._make_safe()
+                    try:
+                        none_more()
+                    finally:  # a signal may come in between
+                        self._supervisor.check = None
+                        self._make_safe()
         finally:
             try:
-                journal.close()
-                self._close_demonstrations()
+                try:
+                    journal.close()
+                finally:
+                    self._close_demonstrations()
             finally:
                 stop.value = True
                 link.join()
@@ -463,7 +470,10 @@ class AsynchronousTrainer(Generic[AlgorithmType]):
         if not path.exists():
             if segments(self._journal_folder):
                 logger.warning("there is no %s: learning begins anew, with all that was collected", path)
-            return
+            path = self.folder / _START
+            # What acts may have an actor that the learner published before it failed.
+            if not (self._is_unfinished and path.exists()):
+                return
         model = self.model
         try:
             learned = type(model).load(path, device=model.device)
@@ -703,12 +713,10 @@ class _Link:
 
     def check(self) -> None:
         """Raise if the learner has failed or gone."""
-        while self.report.poll(0) and self._read() is not None:
-            pass
-        if self._failure is None and self.process.exitcode is not None:
-            code = self.process.exitcode
-            how = f"was killed by signal {signal.Signals(-code).name}" if code < 0 else f"ended with code {code}"
-            self._failure = f"the learner {how}"
+        code = self.process.exitcode  # first: what it said before its end is in the pipe then
+        self._read_all()
+        if code is not None:
+            self._note_end(code)
         self.raise_if_failed()
 
     def raise_if_failed(self) -> None:
@@ -729,14 +737,23 @@ class _Link:
             self.process.kill()
             self.process.join()
             self._failure = self._failure or f"the learner did not stop within {_STOP_SECONDS:.0f} s and was killed"
+        self._read_all()
+        if self.process.exitcode:  # while it saved
+            self._note_end(self.process.exitcode)
+        self.report.close()
+
+    def _note_end(self, code: int) -> None:
+        how = f"was killed by signal {signal.Signals(-code).name}" if code < 0 else f"ended with code {code}"
+        self._failure = self._failure or f"the learner {how}"
+
+    def _read_all(self) -> None:
         while self.report.poll(0) and self._read() is not None:
             pass
-        self.report.close()
 
     def _read(self) -> str | None:
         try:
             kind, content = self.report.recv()
-        except EOFError:
+        except (EOFError, OSError):  # its end, or half a message of one that was killed
             return None
         if kind == "ready":
             self._is_ready = True
@@ -768,10 +785,10 @@ class _AsynchronousCallback(BaseCallback):
 
     def _on_step(self) -> bool:
         self.link.raise_if_failed()
-        if self.link.log:
-            for name, value in self.link.log.items():
+        log, self.link.log = self.link.log, {}  # at once: another thread may look at the link
+        if log:
+            for name, value in log.items():
                 self.logger.record(name, value)
-            self.link.log = {}
             self.logger.record("asynchronous/weights_version", self.link.weights.version)
             self.logger.record("asynchronous/weights_age", self.link.weights.age)
             if self.trainer.real_time is not None:
@@ -806,9 +823,11 @@ def _one_signal() -> Iterator[Callable[[], None]]:
     """The first SIGTERM ends the block by SystemExit, the first SIGINT as it does outside, so that what follows is done.
 
     A second one does not break that off; the third does. A SIGINT that is ignored outside, or that ends nothing there, counts
-    as none. It yields a function after which also the first does not.
+    as none. It yields a function after which the first does not, either: that one does what it does at the end of the block.
+    The end of a terminal, SIGHUP, is as a SIGTERM, unless something was made of it outside.
     """
-    n_signals = 0
+    n_signals, has_raised = 0, False
+    put_off: tuple[int, Any] | None = None
 
     def none_more() -> None:
         nonlocal n_signals
@@ -822,27 +841,35 @@ def _one_signal() -> Iterator[Callable[[], None]]:
     if interrupt == signal.SIG_DFL:  # which would leave the machine as it is
         interrupt = signal.default_int_handler
 
+    def end(number: int, frame: Any) -> None:
+        if number != signal.SIGINT:
+            raise SystemExit(128 + number)
+        interrupt(number, frame)
+
     def handle(number: int, frame: Any) -> None:
-        nonlocal n_signals
+        nonlocal n_signals, has_raised, put_off
         if n_signals == 1:
             n_signals = 2
+            put_off = None if has_raised else (number, frame)
             logger.warning("%s: the machine is being made safe; once more breaks that off", signal.Signals(number).name)
             return
         try:
-            if number == signal.SIGTERM:
-                raise SystemExit(128 + number)
-            interrupt(number, frame)
+            end(number, frame)
         except BaseException:
-            n_signals += 1
+            n_signals, has_raised = n_signals + 1, True
             raise
 
     handled = [signal.SIGTERM, signal.SIGINT] if callable(interrupt) else [signal.SIGTERM]
+    if hasattr(signal, "SIGHUP") and signal.getsignal(signal.SIGHUP) == signal.SIG_DFL:
+        handled.append(signal.SIGHUP)
     before: dict[int, Any] = {number: signal.signal(number, handle) for number in handled}
     try:
         yield none_more
     finally:
         for number, handler in before.items():
             signal.signal(number, handler)
+        if put_off is not None:
+            end(*put_off)
 
 
 @contextmanager

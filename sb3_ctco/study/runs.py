@@ -21,6 +21,7 @@ import torch as th
 from stable_baselines3.common.base_class import BaseAlgorithm
 
 import sb3_ctco
+from sb3_ctco.common.files import replace_durably
 from sb3_ctco.common.lock import LOCK, lock
 from sb3_ctco.evaluation import DiscountedReturnCallback, EpisodeStatistics, evaluate_discounted_return
 from sb3_ctco.study.agents import discount_rate, make_eval_env, make_model
@@ -262,11 +263,8 @@ def write_whole(file: Path, text: str) -> None:
     """Write a file such that whoever reads it sees all of it, or what was there before."""
     part = file.with_name(f"{file.name}.{os.getpid()}")
     try:
-        with part.open("w", encoding="utf-8") as stream:
-            stream.write(text)
-            stream.flush()
-            os.fsync(stream.fileno())  # or a power cut may leave an empty file of that name
-        os.replace(part, file)
+        part.write_text(text, encoding="utf-8")
+        replace_durably(part, file)
     finally:
         part.unlink(missing_ok=True)
 
