@@ -15,7 +15,7 @@ from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecNorm
 from torch.distributions import Normal
 
 from sb3_ctco import CTCO, DictOptionReplayBuffer, FiGARSAC, OptionExecutionWrapper, OptionReplayBuffer
-from sb3_ctco.common.losses import actor_loss, critic_loss, critic_target, log_reference_density
+from sb3_ctco.common.losses import actor_loss, critic_loss, critic_target, log_reference_density, pessimistic_values
 from sb3_ctco.common.policies import EnsembleLinear, squashed_log_prob
 from sb3_ctco.ctco.policies import CTCOPolicy
 from sb3_ctco.options import DEFAULT_DISCOUNT_RATE, discount_rate_from_gamma, step_weight
@@ -560,8 +560,36 @@ def batch_of(model, n=16):
     return batch
 
 
+def test_pessimism_by_hand():
+    """Options of γ = 0.9 and 0.7: shares of 0.1 and 0.3, a half and one and a half of their mean."""
+    q_values, discounts = th.tensor([[[1.0], [5.0]], [[3.0], [4.0]], [[2.0], [9.0]]]), th.tensor([[0.9], [0.7]])
+    assert pessimistic_values(q_values, discounts, "decision").tolist() == [[1.0], [4.0]]
+    by_time = pessimistic_values(q_values, discounts, "time")
+    assert by_time.flatten().tolist() == pytest.approx([2.0 - 0.5 * 1.0, 6.0 - 1.5 * 2.0])
+    # What one length of all options and one critic make no difference to
+    alike = th.full((2, 1), 0.9)
+    th.testing.assert_close(pessimistic_values(q_values, alike, "time"), pessimistic_values(q_values, alike, "decision"))
+    th.testing.assert_close(pessimistic_values(q_values[:1], discounts, "time"), q_values[0])
+
+
+def test_pessimism_by_time_costs_the_same_however_time_is_divided():
+    """Critics that always differ take as much off ten short options as off five of twice the length, and not twice as much."""
+    short, long = 0.99, 0.99**2
+    q_values = th.tensor([[[1.0], [1.0]], [[-1.0], [-1.0]]])  # on average nothing
+    discounts = th.tensor([[short], [long]])
+
+    def value(gamma, once):
+        return once * gamma * (1 - gamma**1000) / (1 - gamma)  # of γ·once + γ²·once + …
+
+    by_decision = pessimistic_values(q_values, discounts, "decision").flatten().tolist()
+    assert value(short, by_decision[0]) / value(long, by_decision[1]) == pytest.approx(2.0, rel=0.02)
+    by_time = pessimistic_values(q_values, discounts, "time").flatten().tolist()
+    assert value(short, by_time[0]) / value(long, by_time[1]) == pytest.approx(1.0, rel=0.02)
+
+
+@pytest.mark.parametrize("critic_pessimism", ["decision", "time"])
 @pytest.mark.parametrize("entropy_reference", ["average", "uniform"])
-def test_one_update_by_hand(entropy_reference, random_walk_env):
+def test_one_update_by_hand(entropy_reference, critic_pessimism, random_walk_env):
     """The critic's loss that train logs, recomputed from the networks with β_h, γ(d) and both entropies."""
     model = make(
         random_walk_env(),
@@ -571,6 +599,7 @@ def test_one_update_by_hand(entropy_reference, random_walk_env):
         high_freq_penalty=0.05,
         trajectory="rbf",
         entropy_reference=entropy_reference,
+        critic_pessimism=critic_pessimism,
     )
     set_temperature_of_d(model, 0.4)
     model.learn(200)
@@ -589,7 +618,12 @@ def test_one_update_by_hand(entropy_reference, random_walk_env):
     with th.no_grad():
         options, log_prob = model.actor.option_log_prob(batch.observations)
         next_options, next_log_prob = model.actor_target.option_log_prob(batch.next_observations)
-        next_q = model.critic_target(batch.next_observations, next_options).min(dim=0)[0]
+        one, two = model.critic_target(batch.next_observations, next_options)
+        next_q = th.minimum(one, two)
+        if critic_pessimism == "time":
+            share = (1 - batch.discounts) / (1 - batch.discounts).mean()
+            assert share.std() > 0.1
+            next_q = (one + two) / 2 - share * (one - two).abs() / 2
         bootstrap = (1 - batch.dones) * batch.discounts * (next_q - cost(next_log_prob))
         target = batch.rewards - 0.05 + bootstrap
         q_values = model.critic(batch.observations, batch.actions)
@@ -853,6 +887,8 @@ def test_action_noise(random_walk_env):
         ({"gamma": 1.5}, "gamma"),
         ({"gamma_dt": 0.0}, "gamma_dt"),
         ({"entropy_reference": "gaussian"}, "entropy_reference"),
+        ({"critic_pessimism": "step"}, r"critic_pessimism must be one of \('decision', 'time'\), not 'step'"),
+        ({"critic_pessimism": "time", "gamma": 1.0}, "gamma=1 has none"),
         ({"target_decision_rate": 0.0}, "target_decision_rate must be a positive number of Hz"),
         (
             {"target_decision_rate": 2.0, "d_max": 0.5},

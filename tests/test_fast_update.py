@@ -40,6 +40,7 @@ def plain(model):
         {"ent_coef": 0.2, "d_min": 0.1, "d_max": 0.1},
         {"entropy_reference": "paper", "duration_scale": "linear"},
         {"entropy_reference": "uniform", "ent_coef": 0.5},
+        {"critic_pessimism": "time"},
         {"policy_kwargs": {"n_critics": 1, "net_arch": [8]}},
         {"policy_kwargs": {"target_actor": False, "net_arch": [8]}},
         {"policy_kwargs": {"n_critics": 3, "net_arch": {"pi": [8, 8, 8], "qf": []}}},

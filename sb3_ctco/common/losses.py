@@ -10,6 +10,8 @@ import torch as th
 
 EntropyReference = Literal["average", "uniform", "paper"]
 ENTROPY_REFERENCES: tuple[EntropyReference, ...] = ("average", "uniform", "paper")
+Pessimism = Literal["decision", "time"]
+PESSIMISMS: tuple[Pessimism, ...] = ("decision", "time")
 
 
 def critic_target(
@@ -27,11 +29,31 @@ def critic_target(
     :param integrated_rewards: R
     :param dones: 1 where the episode terminated (not where it was truncated)
     :param discounts: γ(d) = e^(−τ·duration)
-    :param next_q_values: smallest target Q-value of an option of the target policy
+    :param next_q_values: target Q-value of an option of the target policy, see :func:`pessimistic_values`
     :param next_entropy_costs: β_E log π of that option
     :param high_freq_penalty: β_h
     """
     return integrated_rewards - high_freq_penalty + (1.0 - dones) * discounts * (next_q_values - next_entropy_costs)
+
+
+def pessimistic_values(next_q_values: th.Tensor, discounts: th.Tensor, pessimism: Pessimism) -> th.Tensor:
+    """What critics that disagree say of the next option, in targets: ``[batch, 1]``.
+
+    ``"decision"``: the smallest value, as in SAC (clipped double Q-learning, Fujimoto et al. 2018,
+    https://arxiv.org/abs/1802.09477). Every decision pays for the disagreement, many short options more often than few long.
+
+    ``"time"``: ``mean − (1 − γ(d))/⟨1 − γ(d)⟩·(mean − smallest)``, where ⟨⟩ is the average over the batch. An option pays for
+    the share of the future that it takes, so that it is as much in all however the time is divided. Where all options have
+    one length it is the smallest value.
+
+    :param next_q_values: ``[n_critics, batch, 1]``
+    :param discounts: γ(d) < 1 of the options that led there, ``[batch, 1]``
+    """
+    smallest = next_q_values.amin(dim=0)
+    if pessimism == "decision":
+        return smallest
+    mean, share = next_q_values.mean(dim=0), 1.0 - discounts
+    return mean - share / share.mean() * (mean - smallest)
 
 
 def critic_loss(q_values: th.Tensor, targets: th.Tensor) -> th.Tensor:

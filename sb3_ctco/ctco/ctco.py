@@ -14,7 +14,16 @@ from stable_baselines3.common.utils import FloatSchedule, update_learning_rate
 from torch import nn
 
 from sb3_ctco.common.buffers import DictOptionReplayBuffer, OptionReplayBuffer
-from sb3_ctco.common.losses import ENTROPY_REFERENCES, EntropyReference, actor_loss, critic_target, log_reference_density
+from sb3_ctco.common.losses import (
+    ENTROPY_REFERENCES,
+    PESSIMISMS,
+    EntropyReference,
+    Pessimism,
+    actor_loss,
+    critic_target,
+    log_reference_density,
+    pessimistic_values,
+)
 from sb3_ctco.common.option_algorithm import OptionOffPolicyAlgorithm
 from sb3_ctco.common.soft_actor_critic import SoftOptionActorCritic
 from sb3_ctco.ctco.canonical import CanonicalOptions
@@ -109,6 +118,8 @@ class CTCO(SoftOptionActorCritic):
     :param target_entropy: entropy of an option over the box [−1, 1] that learned temperatures keep, in equal parts for each
         entry of ω and d, or a function of the remaining progress; ``"auto"`` is −dim(ω) − 1
     :param entropy_reference: ``"average"``, ``"uniform"`` or ``"paper"``, see :func:`log_reference_density`
+    :param critic_pessimism: whether the critics' disagreement is paid by ``"decision"``, as in SAC, or by ``"time"``, see
+        :func:`~sb3_ctco.common.losses.pessimistic_values`
     :param fast_updates: whether to compute gradients without autograd where that is known to give the same, see
         :mod:`sb3_ctco.ctco.fast_update`; ``fast_updates_refusal`` says why not where it is not
     :param action_noise: noise added to normalised options while exploring
@@ -166,6 +177,7 @@ class CTCO(SoftOptionActorCritic):
         ent_coef: str | float = "auto_0.02",
         target_entropy: str | float | Schedule = "auto",
         entropy_reference: EntropyReference = "average",
+        critic_pessimism: Pessimism = "decision",
         fast_updates: bool = True,
         action_noise: ActionNoise | None = None,
         replay_buffer_class: type[ReplayBuffer] | None = None,
@@ -218,6 +230,7 @@ class CTCO(SoftOptionActorCritic):
         self.target_decision_rate = target_decision_rate
         self.fast_updates = fast_updates
         self.entropy_reference: EntropyReference = entropy_reference
+        self.critic_pessimism: Pessimism = critic_pessimism
 
         if _init_setup_model:
             self._setup_model()
@@ -265,6 +278,12 @@ class CTCO(SoftOptionActorCritic):
             raise ValueError(
                 "entropy_reference='paper' is of densities over d in s, so it needs duration_scale='linear', not "
                 f"{self.duration_scale!r}"
+            )
+        if self.critic_pessimism not in PESSIMISMS:
+            raise ValueError(f"critic_pessimism must be one of {PESSIMISMS}, not {self.critic_pessimism!r}")
+        if self.critic_pessimism == "time" and self.gamma == 1.0:
+            raise ValueError(
+                "critic_pessimism='time' counts in shares of the discount, and gamma=1 has none: pass a smaller gamma"
             )
         target, (coefficient, _) = self.target_decision_rate, _parse_penalty(self.high_freq_penalty)
         if target is not None and not 0 < target < math.inf:
@@ -371,7 +390,7 @@ class CTCO(SoftOptionActorCritic):
             data.rewards,
             data.dones,
             data.discounts,
-            next_q_values.amin(dim=0),
+            pessimistic_values(next_q_values, data.discounts, self.critic_pessimism),
             next_entropy_costs,
             self._current_high_freq_penalty(),
         )
