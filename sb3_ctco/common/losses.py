@@ -77,8 +77,8 @@ def actor_loss(q_values: th.Tensor, entropy_costs: th.Tensor) -> th.Tensor:
 def log_reference_density(sizes: th.Tensor, d_min: float, d_max: float, reference: EntropyReference) -> th.Tensor | None:
     """Log-density of what entropy is counted relative to, over the normalised option box.
 
-    ``"average"`` is the batch's own average of log π, which is not known beforehand: None. Entropy then costs nothing on
-    average, so that β_h is all that a decision costs.
+    ``"average"`` is the batch's own average of log π, which is not known beforehand: None. Entropy then adds
+    nothing, on average, to what a decision costs.
     ``"uniform"`` is the uniform distribution over all options: log π − log u is never negative on average, so
     a decision is never paid for its entropy, and a policy of little entropy pays for each decision.
     ``"paper"`` is the unit density over (ω, d in s): log π as it stands.
