@@ -142,11 +142,11 @@ def test_weights_are_of_one_version_while_another_process_writes():
 
 
 class UntilLearned(BaseCallback):
-    """Ends acting once the learner's weights have come and so many steps are made, however busy the machine is."""
+    """Ends acting once the learner's weights have come, however busy the machine is; pauses for so many s after each step."""
 
-    def __init__(self, n_steps=0, pause=0.0):
+    def __init__(self, pause=0.0):
         super().__init__()
-        self.n_steps, self.pause = n_steps, pause
+        self.pause = pause
 
     def _weights(self):
         return th.cat([p.detach().flatten() for p in self.model.policy.actor.parameters()])
@@ -156,7 +156,7 @@ class UntilLearned(BaseCallback):
 
     def _on_step(self):
         time.sleep(self.pause)
-        return self.num_timesteps < self.n_steps or th.equal(self._weights(), self.first)
+        return th.equal(self._weights(), self.first)
 
 
 class Watcher(BaseCallback):
@@ -584,7 +584,7 @@ def test_an_environment_that_blocks_is_late_once_and_nothing_is_made_up_for(tmp_
     # The command after it comes at once, and the next one a period later.
     gaps = np.diff(env.times)
     assert gaps[29] > 0.069
-    assert gaps[30] > 0.005
+    assert gaps[30] > 0.015
     assert len(records_of(tmp_path)) == 49
 
 

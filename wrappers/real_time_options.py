@@ -33,6 +33,9 @@ from sb3_ctco.wrappers.option_execution import ON_THE_WAY, OptionExecutionWrappe
 from sb3_ctco.wrappers.real_time import RealTimeWrapper
 from sb3_ctco.wrappers.step_sequence import SequenceResult, StepSequence
 
+#: ``interrupt(observation of the last decision, observation, seconds since that one)``: whether to end the option
+Interrupt = Callable[[Any, Any, float], bool]
+
 
 class _Player:
     """A thread that plays the rests of options.
@@ -65,10 +68,6 @@ def _work(queue: "SimpleQueue[Any]") -> None:
             except BaseException as error:
                 future.set_exception(error)
         del item, future, function, args  # which hold the environment
-
-
-#: ``interrupt(observation of the last decision, observation, seconds since that one)``: whether to end the option
-Interrupt = Callable[[Any, Any, float], bool]
 
 
 class RealTimeOptionWrapper(OptionExecutionWrapper):

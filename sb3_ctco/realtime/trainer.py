@@ -823,8 +823,8 @@ def _one_signal() -> Iterator[Callable[[], None]]:
     """The first SIGTERM ends the block by SystemExit, the first SIGINT as it does outside, so that what follows is done.
 
     A second one does not break that off; the third does. A SIGINT that is ignored outside, or that ends nothing there, counts
-    as none. It yields a function after which the first does not, either: that one does what it does at the end of the block.
-    The end of a terminal, SIGHUP, is as a SIGTERM, unless something was made of it outside.
+    as none. It yields a function after which the first does not break it off, either, but takes effect when the block ends.
+    SIGHUP, the end of a terminal, is as SIGTERM, unless it is handled or ignored outside.
     """
     n_signals, has_raised = 0, False
     put_off: tuple[int, Any] | None = None
