@@ -55,6 +55,7 @@ def test_deviations_are_those_of_the_code():
         "duration_scale",
         "join",
         "d_min",
+        "critic_pessimism",
     }
     assert defaults["high_freq_penalty"] == "relative_0.1"
     assert defaults["entropy_reference"] == "average"

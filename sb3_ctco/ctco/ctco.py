@@ -267,6 +267,7 @@ class CTCO(SoftOptionActorCritic):
             "duration_scale": "linear",
             "join": "free",
             "entropy_reference": "paper",
+            "critic_pessimism": "decision",
             "policy_kwargs": {"n_critics": 1, "net_arch": {"pi": [10, 10], "qf": [64, 64]}},
         }
 
@@ -283,7 +284,8 @@ class CTCO(SoftOptionActorCritic):
             raise ValueError(f"critic_pessimism must be one of {PESSIMISMS}, not {self.critic_pessimism!r}")
         if self.critic_pessimism == "time" and self.gamma == 1.0:
             raise ValueError(
-                "critic_pessimism='time' counts in shares of the discount, and gamma=1 has none: pass a smaller gamma"
+                "critic_pessimism='time' counts in shares of the discount, and gamma=1 has none: pass a smaller gamma, or "
+                "critic_pessimism='decision'"
             )
         target, (coefficient, _) = self.target_decision_rate, _parse_penalty(self.high_freq_penalty)
         if target is not None and not 0 < target < math.inf:
