@@ -84,7 +84,7 @@ def test_the_presets_are_the_grids_that_they_should_be():
     paper, quick = load_preset("paper"), load_preset("quick")
     assert len(paper.select(settings=["paper"])) == 30 * 4 * 3 * 4
     assert {run.task_seconds for run in paper.runs} == {400 * 60}
-    assert len(quick.runs) == 7 * 3 * 4
+    assert len(quick.runs) == 8 * 3 * 4
     for preset in (paper, quick):
         assert {run.rate for run in preset.runs} == {50, 100, 250, 500}
         assert {run.task for run in preset.runs} == {"point_mass", "cheetah", "ball_in_cup"}
@@ -107,9 +107,9 @@ def test_the_presets_are_the_grids_that_they_should_be():
 def test_seeds_may_be_others_than_the_presets() -> None:
     quick = load_preset("quick")
     runs = quick.select(tasks=["cheetah"], seeds=[5, 0])
-    assert [run.seed for run in runs] == [5] * 28 + [0] * 28
-    assert runs[28:] == quick.select(tasks=["cheetah"])
-    assert runs[0] == dataclasses.replace(runs[28], seed=5)
+    assert [run.seed for run in runs] == [5] * 32 + [0] * 32
+    assert runs[32:] == quick.select(tasks=["cheetah"])
+    assert runs[0] == dataclasses.replace(runs[32], seed=5)
     with pytest.raises(ValueError, match=r"seeds must not be negative: \[-1\]"):
         quick.select(seeds=[-1])
 
