@@ -35,16 +35,15 @@ def test_deviations_are_those_of_the_code():
         ("gradient_steps", -1, "one for each primitive step (`gradient_steps=-1`)"),
         ("ent_coef", "auto_0.02", "learned by dual ascent from 0.02"),
         ("learning_starts", 100, "`learning_starts=100` steps play random options"),
-        ("learning_rate", 3e-4, "Adam, 3e-4"),
+        ("learning_rate", 1e-3, "Adam, 1e-3"),
         ("d_max", None, "| a fifth of the horizon 1/τ, 0.5 s | `d_max` |"),
-        ("tau", 0.005, "both targets with 0.005"),
+        ("tau", 0.01, "both targets with 0.01"),
         ("buffer_size", 1_000_000, "a buffer of 1,000,000"),
     ]:
         assert defaults[name] == value, name
         assert name not in set_by_paper_defaults
         assert phrase in TEXT
     assert set(set_by_paper_defaults) == {
-        "batch_size",
         "n_sub_options",
         "n_rbf",
         "high_freq_penalty",
@@ -56,6 +55,7 @@ def test_deviations_are_those_of_the_code():
         "join",
         "d_min",
         "critic_pessimism",
+        "batch_size",
     }
     assert defaults["high_freq_penalty"] == "relative_0.1"
     assert defaults["entropy_reference"] == "average"

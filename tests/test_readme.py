@@ -41,7 +41,7 @@ def test_the_first_example_solves_its_task_by_long_options(seed, tmp_path, monke
     episode_return, steps = re.search(r"return (-?[\d.]+) after (\d+) steps", printed).groups()
     assert sum(lengths) == int(steps)
     assert np.mean(lengths) >= 5
-    # The summit is worth 100, less what driving takes; standing still is worth 0. With 20 seeds it is 92.7 to 96.5.
+    # The summit is worth 100, less what driving takes; standing still is worth 0. With 20 seeds it is 91.2 to 95.0.
     assert float(episode_return) > 80
     assert (tmp_path / "mountain_car.zip").exists()
 

@@ -2,6 +2,7 @@
 
 import csv
 import dataclasses
+import inspect
 import json
 import math
 import os
@@ -20,6 +21,7 @@ import pytest
 import yaml
 from conftest import PATIENCE
 from rliable.metrics import aggregate_iqm, probability_of_improvement
+from stable_baselines3 import SAC
 
 from sb3_ctco import CTCO, registry
 from sb3_ctco.evaluation import evaluate_discounted_return
@@ -102,6 +104,20 @@ def test_the_presets_are_the_grids_that_they_should_be():
     assert [run.seed for run in learning.runs] == [0] * 18 + [1] * 18 + [2] * 18
     for seed in (learning.runs[:18], quick.runs):
         assert [run.rate for run in seed] == sorted((run.rate for run in seed), reverse=True)
+
+
+def test_the_preset_of_both_classes_defaults_names_them():
+    preset = load_preset(str(Path(__file__).parents[1] / "benchmarks" / "bare.yml"))
+    for algorithm, cls, of_the_clock in (("ctco", CTCO, set()), ("sac", SAC, {"gamma_dt"})):
+        defaults = {name: parameter.default for name, parameter in inspect.signature(cls.__init__).parameters.items()}
+        for run in preset.select(algorithms=[algorithm]):
+            named = {name: value for name, value in run.arguments.items() if name not in of_the_clock}
+            # An update a step, and a hundred steps before the first
+            assert named.pop("updates_per_second") == run.rate
+            assert named.pop("learning_starts_seconds") * run.rate == defaults["learning_starts"]
+            assert named == {name: defaults[name] for name in named}
+    ctco = preset.select(algorithms=["ctco"])[0].arguments
+    assert (ctco["learning_rate"], ctco["batch_size"], ctco["tau"]) == (1e-3, 100, 0.01)
 
 
 def test_seeds_may_be_others_than_the_presets() -> None:
