@@ -145,8 +145,8 @@ def test_other_action_spaces_are_refused(scripted_env):
     ("kwargs", "message"),
     [
         ({"d_max": 0.0}, "d_max"),
-        ({"d_min": 0.5, "d_max": 0.2}, "d_min"),
-        ({"d_max": 0.05}, "d_min=0.1 s is longer than d_max=0.05 s"),
+        ({"d_min": 0.5, "d_max": 0.2}, "d_min=0.5 s is longer than d_max=0.2 s"),
+        ({"d_max": 0.05}, r"d_max=0.05 s is shorter than a step of the environment, dt=0.1 s: .* d_max=1, ten steps"),
         ({"n_rbf": 0}, "n_rbf"),
         ({"discount_rate": -1.0}, "discount_rate"),
         ({"reward": "mean"}, "'sum' or 'integral', not 'mean'"),
