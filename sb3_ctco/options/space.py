@@ -63,12 +63,14 @@ class OptionSpace:
         check_seconds(dt=self.dt, d_max=self.d_max, d_min=self.d_min)
         if self.dt > self.d_max:
             raise ValueError(
-                f"d_max={self.d_max:g} s is shorter than a step of the environment, dt={self.dt:g} s: pass a larger one, such as "
-                f"d_max={10 * self.dt:g}, ten steps (by default it is 0.5 s at most), and gamma_dt={self.dt:g} if gamma is "
+                f"d_max={self.d_max:g} s is shorter than a step of the environment, dt={self.dt:g} s: pass a larger one, such "
+                f"as d_max={10 * self.dt:g}, ten steps (by default it is 0.5 s at most), and gamma_dt={self.dt:g} if gamma is "
                 "meant for a step"
             )
         if self.d_min > self.d_max:
-            raise ValueError(f"d_min={self.d_min:g} s is longer than d_max={self.d_max:g} s: raise d_max, or pass a smaller d_min")
+            raise ValueError(
+                f"d_min={self.d_min:g} s is longer than d_max={self.d_max:g} s: raise d_max, or pass a smaller d_min"
+            )
         if not (self.discount_rate >= 0 and math.isfinite(self.discount_rate)):
             raise ValueError(f"discount_rate must be a finite number of 1/s that is at least 0, not {self.discount_rate}")
         if self.duration_scale not in DURATION_SCALES:
