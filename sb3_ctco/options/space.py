@@ -61,7 +61,7 @@ class OptionSpace:
 
     def __post_init__(self) -> None:
         check_seconds(dt=self.dt, d_max=self.d_max, d_min=self.d_min)
-        if self.dt > self.d_max:
+        if self.d_min > self.d_max and self.dt > self.d_max:
             raise ValueError(
                 f"d_max={self.d_max:g} s is shorter than a step of the environment, dt={self.dt:g} s: pass a larger one, such "
                 f"as d_max={10 * self.dt:g}, ten steps (by default it is 0.5 s at most), and gamma_dt={self.dt:g} if gamma is "
