@@ -50,7 +50,7 @@ def train(name: str, args: argparse.Namespace, seed: int) -> Run:
         "learning_rate": args.learning_rate,
         "learning_starts": args.learning_starts,
         "batch_size": args.batch_size,
-        "tau": 0.005,
+        "tau": 0.005,  # SAC's default; CTCO's is another one
         "train_freq": args.train_freq,
         "gradient_steps": args.gradient_steps,
         "policy_kwargs": {"net_arch": args.net_arch},

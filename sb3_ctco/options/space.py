@@ -61,13 +61,13 @@ class OptionSpace:
 
     def __post_init__(self) -> None:
         check_seconds(dt=self.dt, d_max=self.d_max, d_min=self.d_min)
-        if self.d_min > self.d_max and self.dt > self.d_max:
-            raise ValueError(
-                f"d_max={self.d_max:g} s is shorter than a step of the environment, dt={self.dt:g} s: pass a larger one, such "
-                f"as d_max={10 * self.dt:g}, ten steps (by default it is 0.5 s at most), and gamma_dt={self.dt:g} if gamma is "
-                "meant for a step"
-            )
         if self.d_min > self.d_max:
+            if self.dt > self.d_max:
+                raise ValueError(
+                    f"d_max={self.d_max:g} s is shorter than a step of the environment, dt={self.dt:g} s: pass a larger one, "
+                    f"such as d_max={10 * self.dt:g}, ten steps (by default it is 0.5 s at most), and gamma_dt={self.dt:g} if "
+                    "gamma is meant for a step"
+                )
             raise ValueError(
                 f"d_min={self.d_min:g} s is longer than d_max={self.d_max:g} s: raise d_max, or pass a smaller d_min"
             )
